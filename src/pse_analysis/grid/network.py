@@ -1,0 +1,418 @@
+"""An immutable grid model with its admittance matrices.
+
+Branches are π-models with a complex tap at the *from* end, as in MATPOWER:
+
+    [I_f]   [(y + y_c/2)/t²        -y/(t e^{-jφ})] [V_f]
+    [I_t] = [-y/(t e^{jφ})          y + y_c/2    ] [V_t],    y = 1/(r + jx),  y_c = g + jb
+
+All impedances are in per unit on the system base. Bus shunts are constant admittances and belong to
+Y-bus, so an injection never includes them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import enum
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import sparse
+
+from pse_analysis.errors import GridError
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+Columns = TypeVar("Columns", "Buses", "Branches")
+
+
+class BusKind(enum.IntEnum):
+    """What power flow holds at a bus: P and Q, P and |V|, or |V| and θ."""
+
+    PQ = 1
+    PV = 2
+    SLACK = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Buses:
+    """Columns of the bus table, each of length n_bus and read-only.
+
+    Attributes
+    ----------
+    name
+        Names as the literature numbers them.
+    kind
+        Values of `BusKind`.
+    vn_kv
+        Rated line-to-line voltage. [kV]
+    p_load_mw, q_load_mvar
+        Nominal load. [MW, Mvar]
+    p_gen_mw
+        Nominal generation. [MW]
+    vm_set_pu
+        Voltage set-point of PV and slack buses. [p.u.]
+    q_min_mvar, q_max_mvar
+        Reactive limits of the generation; ±inf where none are known. [Mvar]
+    g_shunt_pu, b_shunt_pu
+        Shunt admittance. [p.u.]
+    """
+
+    name: tuple[str, ...]
+    kind: npt.NDArray[np.int8]
+    vn_kv: FloatArray
+    p_load_mw: FloatArray
+    q_load_mvar: FloatArray
+    p_gen_mw: FloatArray
+    vm_set_pu: FloatArray
+    q_min_mvar: FloatArray
+    q_max_mvar: FloatArray
+    g_shunt_pu: FloatArray
+    b_shunt_pu: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Branches:
+    """Columns of the branch table, each of length n_branch and read-only.
+
+    Attributes
+    ----------
+    name
+        ``from-to``; a parallel circuit carries ``#2``, ``#3``, …
+    from_bus, to_bus
+        Positions of the end buses.
+    r_pu, x_pu, g_pu, b_pu
+        Series impedance and total charging admittance. [p.u.]
+    tap
+        Ratio at the from end; 1 where there is no transformer.
+    shift_rad
+        Phase shift at the from end. [rad]
+    in_service
+        Whether the branch is closed at both ends.
+    """
+
+    name: tuple[str, ...]
+    from_bus: IntArray
+    to_bus: IntArray
+    r_pu: FloatArray
+    x_pu: FloatArray
+    g_pu: FloatArray
+    b_pu: FloatArray
+    tap: FloatArray
+    shift_rad: FloatArray
+    in_service: npt.NDArray[np.bool_]
+
+
+_INTEGER = {"from_bus", "to_bus"}
+
+
+def _freeze(columns: Columns) -> None:
+    """Give every column its type, one length, and no way to be written to."""
+    length = len(columns.name)
+    for field in dataclasses.fields(columns):
+        if field.name == "name":
+            object.__setattr__(columns, "name", tuple(map(str, columns.name)))
+            continue
+        kind: npt.DTypeLike = np.float64
+        if field.name in _INTEGER:
+            kind = np.int64
+        elif field.name == "in_service":
+            kind = np.bool_
+        elif field.name == "kind":
+            kind = np.int8
+        array = np.array(getattr(columns, field.name), dtype=kind)
+        if array.shape != (length,):
+            raise GridError(
+                f"{type(columns).__name__}.{field.name}: expected {length} values, one per name, "
+                f"received shape {array.shape}"
+            )
+        array.flags.writeable = False
+        object.__setattr__(columns, field.name, array)
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A balanced grid in per unit; every change returns a new one.
+
+    Parameters
+    ----------
+    name
+        For messages and figures.
+    base_mva
+        Three-phase base power. [MVA]
+    buses, branches
+        The tables.
+
+    Raises
+    ------
+    GridError
+        On repeated names, an end bus that does not exist, a zero series impedance, a value that is
+        not finite, or anything but one slack bus.
+    """
+
+    name: str
+    base_mva: float
+    buses: Buses
+    branches: Branches
+
+    def __post_init__(self) -> None:
+        _freeze(self.buses)
+        _freeze(self.branches)
+        bus, branch = self.buses, self.branches
+        if not self.base_mva > 0:
+            raise GridError(f"{self.name}: base_mva must be positive, received {self.base_mva}")
+        for table, names in (("buses", bus.name), ("branches", branch.name)):
+            if len(set(names)) != len(names):
+                repeated = next(n for n in names if names.count(n) > 1)
+                raise GridError(
+                    f"{self.name}: {table} must have distinct names, {repeated!r} repeats"
+                )
+        ends = np.concatenate([branch.from_bus, branch.to_bus])
+        if ends.size and (ends.min() < 0 or ends.max() >= self.n_bus):
+            raise GridError(
+                f"{self.name}: branch ends must lie in 0…{self.n_bus - 1}, received "
+                f"{ends.min()}…{ends.max()}"
+            )
+        short = branch.in_service & (branch.r_pu == 0) & (branch.x_pu == 0)
+        if short.any():
+            culprit = branch.name[int(np.argmax(short))]
+            raise GridError(
+                f"{self.name}: branch {culprit!r} has zero impedance: merge its buses instead"
+            )
+        for table, columns in (("buses", bus), ("branches", branch)):
+            for field in dataclasses.fields(columns):
+                if field.name in ("name", "q_min_mvar", "q_max_mvar"):
+                    continue
+                values = np.asarray(getattr(columns, field.name), dtype=float)
+                if not np.isfinite(values).all():
+                    culprit = columns.name[int(np.argmin(np.isfinite(values)))]
+                    raise GridError(
+                        f"{self.name}: {table}.{field.name} must be finite, "
+                        f"{culprit!r} has {values[~np.isfinite(values)][0]}"
+                    )
+        slacks = int((bus.kind == BusKind.SLACK).sum())
+        if slacks != 1:
+            raise GridError(f"{self.name}: expected one slack bus, received {slacks}")
+
+    # ------------------------------------------------------------------------------- look-ups
+
+    @property
+    def n_bus(self) -> int:
+        """Number of buses, N."""
+        return len(self.buses.name)
+
+    @property
+    def n_branch(self) -> int:
+        """Number of branches, in service or not."""
+        return len(self.branches.name)
+
+    @property
+    def slack(self) -> int:
+        """Position of the slack bus."""
+        return int(np.argmax(self.buses.kind == BusKind.SLACK))
+
+    @cached_property
+    def _bus_position(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.buses.name)}
+
+    @cached_property
+    def _branch_position(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.branches.name)}
+
+    def bus(self, name: str) -> int:
+        """Position of a bus.
+
+        Raises
+        ------
+        GridError
+            With the closest names, if there is none.
+        """
+        return self._position("bus", name, self._bus_position)
+
+    def branch(self, name: str) -> int:
+        """Position of a branch.
+
+        Raises
+        ------
+        GridError
+            With the closest names, if there is none.
+        """
+        return self._position("branch", name, self._branch_position)
+
+    def _position(self, kind: str, name: str, position: dict[str, int]) -> int:
+        if name in position:
+            return position[name]
+        close = difflib.get_close_matches(str(name), position, n=3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"it has {len(position)} of them"
+        raise GridError(f"{self.name} has no {kind} {name!r}: {hint}")
+
+    # ----------------------------------------------------------------------------- admittance
+
+    @cached_property
+    def base_ka(self) -> FloatArray:
+        """Base current of each bus. [kA], (n_bus,)"""
+        return np.asarray(self.base_mva / (np.sqrt(3.0) * self.buses.vn_kv))
+
+    @cached_property
+    def _two_port(self) -> tuple[ComplexArray, ...]:
+        """Entries (ff, ft, tf, tt) of each branch; zero where it is out of service."""
+        b = self.branches
+        closed = b.in_service
+        impedance = np.where(closed, b.r_pu + 1j * b.x_pu, 1.0)
+        series = np.where(closed, 1.0 / impedance, 0.0)
+        half = np.where(closed, 0.5 * (b.g_pu + 1j * b.b_pu), 0.0)
+        tap = b.tap * np.exp(1j * b.shift_rad)
+        own = series + half
+        entries = (own / b.tap**2, -series / tap.conj(), -series / tap, own)
+        return tuple(np.asarray(entry, dtype=np.complex128) for entry in entries)
+
+    def _end_matrix(self, at_from: ComplexArray, at_to: ComplexArray) -> sparse.csr_array:
+        rows = np.arange(self.n_branch)
+        return sparse.csr_array(
+            (
+                np.concatenate([at_from, at_to]),
+                (
+                    np.concatenate([rows, rows]),
+                    np.concatenate([self.branches.from_bus, self.branches.to_bus]),
+                ),
+            ),
+            shape=(self.n_branch, self.n_bus),
+        )
+
+    @cached_property
+    def y_from(self) -> sparse.csr_array:
+        """Current into each branch at its from end is ``y_from @ V``. (n_branch, n_bus) [p.u.]"""
+        ff, ft, _, _ = self._two_port
+        return self._end_matrix(ff, ft)
+
+    @cached_property
+    def y_to(self) -> sparse.csr_array:
+        """Current into each branch at its to end is ``y_to @ V``. (n_branch, n_bus) [p.u.]"""
+        _, _, tf, tt = self._two_port
+        return self._end_matrix(tf, tt)
+
+    @cached_property
+    def y_bus(self) -> sparse.csr_array:
+        """Injected current is ``y_bus @ V``, every diagonal stored. (n_bus, n_bus) [p.u.]"""
+        ff, ft, tf, tt = self._two_port
+        f, t = self.branches.from_bus, self.branches.to_bus
+        own = np.arange(self.n_bus)
+        shunt = self.buses.g_shunt_pu + 1j * self.buses.b_shunt_pu
+        matrix = sparse.coo_array(
+            (
+                np.concatenate([ff, ft, tf, tt, shunt]),
+                (np.concatenate([f, f, t, t, own]), np.concatenate([f, t, f, t, own])),
+            ),
+            shape=(self.n_bus, self.n_bus),
+        ).tocsr()
+        matrix.sum_duplicates()
+        return matrix
+
+    @property
+    def p_nominal_pu(self) -> FloatArray:
+        """Nominal net injection, generation minus load. (n_bus,) [p.u.]"""
+        return np.asarray((self.buses.p_gen_mw - self.buses.p_load_mw) / self.base_mva)
+
+    @property
+    def q_nominal_pu(self) -> FloatArray:
+        """Nominal net reactive injection of the loads. (n_bus,) [p.u.]"""
+        return np.asarray(-self.buses.q_load_mvar / self.base_mva)
+
+    # -------------------------------------------------------------------------------- topology
+
+    def open_branch(self, name: str) -> Network:
+        """The same grid with one branch out of service."""
+        in_service = self.branches.in_service.copy()
+        in_service[self.branch(name)] = False
+        return dataclasses.replace(
+            self, branches=dataclasses.replace(self.branches, in_service=in_service)
+        )
+
+    def islands(self) -> npt.NDArray[np.int32]:
+        """Label of the connected component of each bus. (n_bus,)"""
+        closed = self.branches.in_service
+        graph = sparse.coo_array(
+            (
+                np.ones(int(closed.sum())),
+                (self.branches.from_bus[closed], self.branches.to_bus[closed]),
+            ),
+            shape=(self.n_bus, self.n_bus),
+        )
+        return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])
+
+    # ---------------------------------------------------------------------------------- tables
+
+    def to_tables(self) -> dict[str, pd.DataFrame]:
+        """The grid as tables ``network``, ``buses`` and ``branches``; branch ends by name."""
+        buses = pd.DataFrame(
+            {f.name: getattr(self.buses, f.name) for f in dataclasses.fields(Buses)}
+        )
+        branches = pd.DataFrame(
+            {f.name: getattr(self.branches, f.name) for f in dataclasses.fields(Branches)}
+        )
+        for end in ("from_bus", "to_bus"):
+            branches[end] = [self.buses.name[i] for i in branches[end]]
+        network = pd.DataFrame({"name": [self.name], "base_mva": [float(self.base_mva)]})
+        return {"network": network, "buses": buses, "branches": branches}
+
+    @classmethod
+    def from_tables(
+        cls, network: pd.DataFrame, buses: pd.DataFrame, branches: pd.DataFrame
+    ) -> Network:
+        """The grid from the tables that `to_tables` describes.
+
+        Raises
+        ------
+        GridError
+            On a missing column or a branch that ends at an unknown bus.
+        """
+        wanted = {
+            "network": (network, ["name", "base_mva"]),
+            "buses": (buses, [f.name for f in dataclasses.fields(Buses)]),
+            "branches": (branches, [f.name for f in dataclasses.fields(Branches)]),
+        }
+        for table, (frame, columns) in wanted.items():
+            missing = [n for n in columns if n not in frame.columns]
+            if missing:
+                raise GridError(
+                    f"grid table {table!r}: column {missing[0]!r} is missing; expected "
+                    f"{', '.join(columns)}; received {', '.join(map(str, frame.columns))}"
+                )
+        if len(network) != 1:
+            raise GridError(f"grid table 'network': expected one row, received {len(network)}")
+        names = tuple(buses["name"].astype(str))
+        position = {n: i for i, n in enumerate(names)}
+        ends: dict[str, list[int]] = {}
+        for end in ("from_bus", "to_bus"):
+            labels = branches[end].astype(str)
+            unknown = [b for b in labels if b not in position]
+            if unknown:
+                raise GridError(
+                    f"grid table 'branches': {end} {unknown[0]!r} is no bus; expected a name of "
+                    "grid table 'buses'"
+                )
+            ends[end] = [position[b] for b in labels]
+        bus_columns = {
+            f.name: buses[f.name].to_numpy() for f in dataclasses.fields(Buses) if f.name != "name"
+        }
+        branch_columns = {
+            f.name: branches[f.name].to_numpy()
+            for f in dataclasses.fields(Branches)
+            if f.name not in ("name", "from_bus", "to_bus")
+        }
+        return cls(
+            name=str(network["name"].iloc[0]),
+            base_mva=float(network["base_mva"].iloc[0]),
+            buses=Buses(name=names, **bus_columns),
+            branches=Branches(
+                name=tuple(branches["name"].astype(str)),
+                from_bus=np.asarray(ends["from_bus"]),
+                to_bus=np.asarray(ends["to_bus"]),
+                **branch_columns,
+            ),
+        )
