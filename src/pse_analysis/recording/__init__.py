@@ -1,0 +1,7 @@
+"""Recordings of a case for the Rerun viewer: one ``.rrd`` per stage, read from its tables."""
+
+from __future__ import annotations
+
+from pse_analysis.recording.telemetry import aligned, validated
+
+__all__ = ["aligned", "validated"]

@@ -1,0 +1,306 @@
+"""The marks that recordings are made of: lines, dots, bands, lanes, a grid, a page of text.
+
+Everything known about Rerun's archetypes is here, so that a change of its interface meets one file.
+Samples go in as columns, never row by row, and several series of the same instants go into one
+entity: the viewer slows down with the number of entities, not with the number of samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import rerun as rr
+import rerun.blueprint as rrb
+
+from pse_analysis.drawing import layout, round_up, sequential
+from pse_analysis.grid.network import Network
+
+APPLICATION = "pse_analysis"
+TIMELINE = "time"
+TRUTH = "#B4B4B4"
+BOUND = "#8C8C8C"
+
+# The graph view takes positions as screen points and draws text at a fixed size: this is the
+# distance between neighbours at which a bus name fits inside its node.
+_HOP = 46.0
+
+
+@contextmanager
+def recording(path: str | Path, case: str, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A stream into one file; all files of a case share an id, so the viewer shows them as one.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ``.rrd`` file to write; replaced if it exists.
+    case : str
+        Name of the case.
+    blueprint : Blueprint
+        What the viewer opens on.
+    """
+    stream = rr.RecordingStream(APPLICATION, recording_id=f"{APPLICATION}-{case}")
+    stream.save(path, default_blueprint=blueprint)
+    try:
+        stream.send_recording_name(case)
+        yield stream
+    finally:
+        stream.flush()
+        stream.disconnect()
+
+
+def time_column(times: pd.Series | pd.DatetimeIndex) -> rr.TimeColumn:
+    """Instants as Rerun wants them: UTC without a time zone, in nanoseconds."""
+    index = pd.DatetimeIndex(times)
+    if index.tz is not None:
+        index = index.tz_convert("UTC").tz_localize(None)
+    return rr.TimeColumn(TIMELINE, timestamp=index.as_unit("ns").to_numpy())
+
+
+def lines(
+    stream: rr.RecordingStream,
+    entity: str,
+    frame: pd.DataFrame,
+    colours: Sequence[str] | None = None,
+    width: float = 1.5,
+) -> None:
+    """One line per column of the frame, all in one entity.
+
+    Parameters
+    ----------
+    stream : RecordingStream
+        Where to.
+    entity : str
+        Entity path.
+    frame : (n_instant, n_series) DataFrame
+        Index: instants; columns: what the legend says; NaN makes a gap.
+    colours : sequence of str, optional
+        One per column; the viewer's own where absent.
+    width : float
+        Of the stroke, in points.
+    """
+    if frame.empty:
+        return
+    style = rr.SeriesLines(
+        names=[str(name) for name in frame.columns],
+        widths=[width] * frame.shape[1],
+        colors=None if colours is None else [_rgb(colour) for colour in colours],
+    )
+    stream.log(entity, style, static=True)
+    _scalars(stream, entity, frame)
+
+
+def dots(
+    stream: rr.RecordingStream,
+    entity: str,
+    frame: pd.DataFrame,
+    colours: Sequence[str],
+    size: float = 2.5,
+    marker: str = "circle",
+) -> None:
+    """One row of dots per column of the frame, all in one entity; see `lines`."""
+    if frame.empty:
+        return
+    style = rr.SeriesPoints(
+        names=[str(name) for name in frame.columns],
+        colors=[_rgb(colour) for colour in colours],
+        marker_sizes=[size] * frame.shape[1],
+        markers=[marker] * frame.shape[1],
+    )
+    stream.log(entity, style, static=True)
+    _scalars(stream, entity, frame)
+
+
+def _scalars(stream: rr.RecordingStream, entity: str, frame: pd.DataFrame) -> None:
+    columns = rr.Scalars.columns(scalars=frame.to_numpy(dtype=np.float64).reshape(-1))
+    stream.send_columns(
+        entity,
+        indexes=[time_column(pd.DatetimeIndex(frame.index))],
+        columns=columns.partition([frame.shape[1]] * len(frame)),
+    )
+
+
+def band(
+    stream: rr.RecordingStream,
+    entity: str,
+    value: pd.Series,
+    sigma: pd.Series,
+    name: str,
+    colour: str,
+    unit: str,
+) -> None:
+    """A line with its ±σ band; the only use of Rerun's ``Measurements``, which is marked unstable.
+
+    Parameters
+    ----------
+    stream : RecordingStream
+        Where to.
+    entity : str
+        Entity path.
+    value, sigma : (n,) Series
+        Index: instants. A value that is not finite is left out.
+    name, colour, unit : str
+        For the legend.
+    """
+    known = np.isfinite(value.to_numpy())
+    if not known.any():
+        return
+    style = rr.Measurements.from_fields(names=[name], colors=[_rgb(colour)], units=[unit])
+    stream.log(entity, style, static=True)
+    stream.send_columns(
+        entity,
+        indexes=[time_column(pd.DatetimeIndex(value.index[known]))],
+        columns=rr.Measurements.columns(
+            values=value.to_numpy(dtype=np.float64)[known],
+            variances=sigma.fillna(0.0).to_numpy(dtype=np.float64)[known] ** 2,
+        ),
+    )
+
+
+def lane(
+    stream: rr.RecordingStream,
+    entity: str,
+    times: pd.DatetimeIndex,
+    states: Sequence[str | None],
+    colours: Mapping[str, str],
+) -> None:
+    """A lane of states, stored only where the state changes.
+
+    Parameters
+    ----------
+    stream : RecordingStream
+        Where to.
+    entity : str
+        Entity path; its last part names the lane.
+    times : (n,) DatetimeIndex
+        In ascending order.
+    states : (n,) sequence of str or None
+        None leaves a gap.
+    colours : mapping
+        Colour by state.
+    """
+    if not len(times):
+        return
+    state = np.array(["" if s is None else s for s in states], dtype=object)
+    change = np.concatenate([[True], state[1:] != state[:-1]])
+    seen = [s for s in dict.fromkeys(state) if s]
+    stream.log(
+        entity,
+        rr.StateConfiguration(
+            values=seen, labels=seen, colors=[_rgb(colours.get(s, BOUND)) for s in seen]
+        ),
+        static=True,
+    )
+    stream.send_columns(
+        entity,
+        indexes=[time_column(times[change])],
+        columns=rr.StateChange.columns(state=[s or None for s in state[change]]),
+    )
+
+
+def grid(
+    stream: rr.RecordingStream,
+    entity: str,
+    network: Network,
+    values: pd.DataFrame,
+    *,
+    largest: float,
+    scale: float,
+    unit: str,
+) -> None:
+    """The grid as a graph whose buses change their colour over time, with its colour scale below.
+
+    Parameters
+    ----------
+    stream : RecordingStream
+        Where to.
+    entity : str
+        Entity path.
+    network : Network
+        Branches out of service are not drawn.
+    values : (n_instant, n_bus) DataFrame
+        Index: instants; columns: bus names in the grid's order.
+    largest : float
+        Value of the last colour, in the unit of `values`.
+    scale : float
+        Factor from `values` to `unit`, for the text of the colour scale.
+    unit : str
+        Unit that the colour scale is labelled with.
+    """
+    xy = layout(network)
+    at = (xy - xy.min(axis=0)) * [_HOP, -_HOP]
+    names = list(network.buses.name)
+    live = network.branches.in_service
+    pairs = zip(network.branches.from_bus[live], network.branches.to_bus[live], strict=True)
+    stream.log(
+        entity,
+        rr.GraphNodes(node_ids=names, positions=at, labels=names, show_labels=True),
+        rr.GraphEdges(edges=[(names[i], names[j]) for i, j in pairs], graph_type="undirected"),
+        static=True,
+    )
+    rgb = sequential(values.to_numpy(dtype=np.float64), largest)
+    stream.send_columns(
+        entity,
+        indexes=[time_column(pd.DatetimeIndex(values.index))],
+        columns=rr.GraphNodes.columns(colors=_packed(rgb)).partition([len(names)] * len(values)),
+    )
+    ticks = np.linspace(0.0, largest, 6)
+    texts = [f"{tick * scale:g}" for tick in ticks]
+    texts[-1] = f"≥ {texts[-1]} {unit}"
+    x = np.linspace(0.0, 5 * 1.7 * _HOP, 6)
+    stream.log(
+        f"{entity}/scale",
+        rr.GraphNodes(
+            node_ids=[f"scale {i}" for i in range(6)],
+            positions=np.stack([x, np.full(6, at[:, 1].max() + 1.8 * _HOP)], axis=1),
+            labels=texts,
+            colors=_packed(sequential(ticks, largest)),
+            show_labels=True,
+        ),
+        static=True,
+    )
+
+
+def page(stream: rr.RecordingStream, entity: str, markdown: str) -> None:
+    """A page of text."""
+    document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
+    stream.log(entity, document, static=True)
+
+
+def window(start: pd.Timestamp, end: pd.Timestamp) -> rrb.TimeAxis:
+    """A time axis that opens on the given window and is shared by all plots."""
+    bounds = [
+        rr.TimeRangeBoundary.absolute(nanos=pd.Timestamp(moment).value) for moment in (start, end)
+    ]
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=bounds[0], end=bounds[1]))
+
+
+def panels(*parts: rrb.BlueprintPart) -> rrb.Blueprint:
+    """A blueprint with the panels at the sides folded away."""
+    return rrb.Blueprint(
+        *parts,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+    )
+
+
+def scale_end(values: npt.ArrayLike) -> float:
+    """A round end for a colour scale that nearly all values lie below."""
+    v = np.abs(np.asarray(values, dtype=np.float64))
+    v = v[np.isfinite(v)]
+    return round_up(float(np.quantile(v, 0.98))) if v.size else 1.0
+
+
+def _rgb(colour: str) -> list[int]:
+    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+
+
+def _packed(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
+    """Colours as 0xRRGGBBFF, the form that Rerun takes without looking at each."""
+    c = rgb.reshape(-1, 3).astype(np.uint32)
+    return np.asarray((c[:, 0] << 24) | (c[:, 1] << 16) | (c[:, 2] << 8) | 0xFF, dtype=np.uint32)
