@@ -1,0 +1,70 @@
+# make run [CASE=name|all]   run a case from raw telemetry to its table of scores
+# make notebooks             open the notebooks in JupyterLab
+# make view [CASE=name]      open a case's recordings in the Rerun viewer
+# make test                  everything that CI checks
+# make install               create .venv with the pinned development tools
+
+CASE ?= ieee33
+VENV := .venv
+BIN := $(VENV)/bin
+BASE := $(shell command -v python3.11 || command -v python3)
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+NOTEBOOKS := $(wildcard notebooks/*.ipynb)
+
+.DEFAULT_GOAL := run
+.PHONY: run notebooks view test lint types tests cases-all notebook-tests install clean
+
+run: $(VENV)/.runtime
+	@$(BIN)/pse run $(CASE)
+
+notebooks: $(VENV)/.dev
+	$(BIN)/jupyter lab notebooks
+
+view: run
+	@$(BIN)/pse view $(CASE)
+
+install: $(VENV)/.dev
+
+test: lint types cases-all notebook-tests tests
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+cases-all: $(VENV)/.dev
+	$(BIN)/pse run all
+
+# The notebooks read what the cases left behind. Warnings of notebook machinery are not ours to mend.
+notebook-tests: $(VENV)/.dev cases-all
+	$(if $(NOTEBOOKS),$(BIN)/python -m pytest --nbmake --nbmake-timeout=600 -W default $(NOTEBOOKS),@true)
+
+tests: $(VENV)/.dev
+	$(BIN)/python -m pytest tests
+
+clean:
+	rm -rf $(VENV) data/processed/*/ .pytest_cache .mypy_cache .ruff_cache
+
+# Debian keeps ensurepip in a package of its own; where it is missing, the pip that is there serves.
+$(BIN)/python:
+	@test -n "$(BASE)" || { echo "no python3: install Python 3.11 or later"; exit 1; }
+	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "expected Python 3.11 or later, found $$($(BASE) --version) at $(BASE)"; exit 1; }
+	@echo "creating $(VENV) with $(BASE)"
+	@$(BASE) -m venv $(VENV) 2>/dev/null || { \
+		rm -rf $(VENV); $(BASE) -m venv --without-pip $(VENV) \
+		&& $(BASE) -m pip --python $(BIN)/python install --quiet pip; } || { \
+		rm -rf $(VENV); echo "no venv: install it first, on Debian: apt-get install python3-venv"; exit 1; }
+
+# A development install holds the runtime too, so that it satisfies both stamps.
+$(VENV)/.runtime: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing pse_analysis into $(VENV)"
+	@$(INSTALL) -e .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing pse_analysis and its development tools into $(VENV)"
+	@$(INSTALL) -e ".[dev]"
+	@touch $@ $(VENV)/.runtime

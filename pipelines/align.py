@@ -1,0 +1,8 @@
+"""Bring a case's telemetry onto the instants of its study: python pipelines/align.py CASE... [--force]."""
+
+import sys
+
+from run import stage_main
+
+if __name__ == "__main__":
+    sys.exit(stage_main("align"))
