@@ -1,9 +1,12 @@
-"""Grid models: buses, branches, admittance, power flow and a small library of test grids."""
+"""Grid models: buses, branches, admittance, and a small library of test grids.
+
+Power flow stands in `pse_analysis.grid.power_flow`; it uses the measurement model, so it comes
+after it.
+"""
 
 from __future__ import annotations
 
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Branches, Buses, BusKind, Network
-from pse_analysis.grid.power_flow import PowerFlow, solve
 
-__all__ = ["Branches", "BusKind", "Buses", "Network", "PowerFlow", "library", "solve"]
+__all__ = ["Branches", "BusKind", "Buses", "Network", "library"]
