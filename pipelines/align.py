@@ -1,4 +1,4 @@
-"""Bring a case's telemetry onto the instants of its study: python pipelines/align.py CASE... [--force]."""
+"""Bring telemetry onto the instants of the study: python pipelines/align.py CASE... [--force]."""
 
 import sys
 

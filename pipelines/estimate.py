@@ -1,4 +1,4 @@
-"""Estimate a case's states with each of its methods: python pipelines/estimate.py CASE... [--force]."""
+"""Estimate a case's states with each method: python pipelines/estimate.py CASE... [--force]."""
 
 import sys
 
