@@ -224,18 +224,21 @@ def _scored(network, n_trial, rng) -> pd.DataFrame:
     rows = []
     for trial in range(n_trial):
         for method, sigma in METHODS.items():
-            row = [(name, "", value, unit) for name, value, unit in (
-                ("vm_error_mean", sigma, "pu"),
-                ("vm_error_max", 6 * sigma, "pu"),
-                ("va_error_mean", sigma / 2, "rad"),
-                ("va_error_max", 3 * sigma, "rad"),
-                ("nis_ratio", 1 + 200 * sigma, ""),
-                ("nees_ratio", 1.0, ""),
-                ("coverage_vm", 0.95, ""),
-                ("coverage_va", 0.94, ""),
-                ("seconds", 0.3, "s"),
-                ("steps_not_ok", 0.0, ""),
-            )]
+            row = [
+                (name, "", value, unit)
+                for name, value, unit in (
+                    ("vm_error_mean", sigma, "pu"),
+                    ("vm_error_max", 6 * sigma, "pu"),
+                    ("va_error_mean", sigma / 2, "rad"),
+                    ("va_error_max", 3 * sigma, "rad"),
+                    ("nis_ratio", 1 + 200 * sigma, ""),
+                    ("nees_ratio", 1.0, ""),
+                    ("coverage_vm", 0.95, ""),
+                    ("coverage_va", 0.94, ""),
+                    ("seconds", 0.3, "s"),
+                    ("steps_not_ok", 0.0, ""),
+                )
+            ]
             for name in network.buses.name:
                 size = sigma * rng.uniform(0.5, 1.5)
                 row.append(("vm_error_mean", f"bus/{name}", size, "pu"))

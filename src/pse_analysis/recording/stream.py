@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,9 @@ _HOP = 46.0
 
 
 @contextmanager
-def recording(path: str | Path, case: str, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+def recording(
+    path: str | Path, case: str, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
     """A stream into one file; all files of a case share an id, so the viewer shows them as one.
 
     Parameters
@@ -131,7 +134,6 @@ def band(
     sigma: pd.Series,
     name: str,
     colour: str,
-    unit: str,
 ) -> None:
     """A line with its ±σ band; the only use of Rerun's ``Measurements``, which is marked unstable.
 
@@ -143,13 +145,13 @@ def band(
         Entity path.
     value, sigma : (n,) Series
         Index: instants. A value that is not finite is left out.
-    name, colour, unit : str
+    name, colour : str
         For the legend.
     """
     known = np.isfinite(value.to_numpy())
     if not known.any():
         return
-    style = rr.Measurements.from_fields(names=[name], colors=[_rgb(colour)], units=[unit])
+    style = rr.Measurements.from_fields(names=[name], colors=[_rgb(colour)])
     stream.log(entity, style, static=True)
     stream.send_columns(
         entity,
@@ -185,7 +187,8 @@ def lane(
     """
     if not len(times):
         return
-    state = np.array(["" if s is None else s for s in states], dtype=object)
+    # An empty string ends a state; None would become the word.
+    state = np.array([s or "" for s in states], dtype=object)
     change = np.concatenate([[True], state[1:] != state[:-1]])
     seen = [s for s in dict.fromkeys(state) if s]
     stream.log(
@@ -198,7 +201,7 @@ def lane(
     stream.send_columns(
         entity,
         indexes=[time_column(times[change])],
-        columns=rr.StateChange.columns(state=[s or None for s in state[change]]),
+        columns=rr.StateChange.columns(state=list(state[change])),
     )
 
 
@@ -271,12 +274,79 @@ def page(stream: rr.RecordingStream, entity: str, markdown: str) -> None:
     stream.log(entity, document, static=True)
 
 
-def window(start: pd.Timestamp, end: pd.Timestamp) -> rrb.TimeAxis:
-    """A time axis that opens on the given window and is shared by all plots."""
-    bounds = [
-        rr.TimeRangeBoundary.absolute(nanos=pd.Timestamp(moment).value) for moment in (start, end)
-    ]
-    return rrb.TimeAxis(view_range=rr.TimeRange(start=bounds[0], end=bounds[1]))
+@dataclass(frozen=True)
+class Window:
+    """The time that plots open on."""
+
+    start: pd.Timestamp
+    end: pd.Timestamp
+
+    def axis(self) -> rrb.TimeAxis:
+        """Time axis with a small margin, without which the labels at both ends are cut off."""
+        margin = 0.03 * (self.end - self.start)
+        bounds = [
+            rr.TimeRangeBoundary.absolute(nanos=moment.as_unit("ns").value)
+            for moment in (self.start - margin, self.end + margin)
+        ]
+        return rrb.TimeAxis(view_range=rr.TimeRange(start=bounds[0], end=bounds[1]))
+
+    def plot(
+        self,
+        origin: str,
+        name: str,
+        values: npt.ArrayLike,
+        *,
+        zero: bool = False,
+        legend: bool = True,
+        contents: Sequence[str] | None = None,
+    ) -> rrb.TimeSeriesView:
+        """A plot whose vertical axis holds the given values.
+
+        Parameters
+        ----------
+        origin : str
+            Entity path that the plot shows.
+        name : str
+            Title, with the unit.
+        values : array_like
+            What must be visible.
+        zero : bool
+            Whether the axis starts at zero.
+        legend : bool
+            Whether to name the series.
+        contents : sequence of str, optional
+            Query of the entities to show; default: everything below the origin.
+        """
+        v = np.asarray(values, dtype=np.float64)
+        v = v[np.isfinite(v)]
+        low, high = (float(v.min()), float(v.max())) if v.size else (0.0, 1.0)
+        low = 0.0 if zero else low
+        margin = 0.06 * (high - low) or 0.05 * max(abs(high), 1e-3)
+        return rrb.TimeSeriesView(
+            origin=origin,
+            contents=contents if contents is not None else "$origin/**",
+            name=name,
+            axis_x=self.axis(),
+            axis_y=rrb.ScalarAxis(range=(low if zero else low - margin, high + margin)),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+        )
+
+    def lanes(self, origin: str, name: str) -> rrb.StateTimelineView:
+        """The lanes below an entity path."""
+        return rrb.StateTimelineView(origin=origin, name=name, time_view=self.axis())
+
+
+def entity_path(*parts: str) -> str:
+    """Entity path of the parts; ``:`` and ``/`` in a part part it again.
+
+    The viewer prints other signs than letters, digits, ``_``, ``-`` and ``.`` with a backslash.
+    """
+    return "/".join(
+        rr.escape_entity_path_part(piece)
+        for part in parts
+        for piece in part.replace(":", "/").split("/")
+        if piece
+    )
 
 
 def panels(*parts: rrb.BlueprintPart) -> rrb.Blueprint:
@@ -287,6 +357,12 @@ def panels(*parts: rrb.BlueprintPart) -> rrb.Blueprint:
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
     )
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table for a page of text."""
+    ruler = ["---"] * len(head)
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ruler, *rows))
 
 
 def scale_end(values: npt.ArrayLike) -> float:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+import rerun as rr
 import rerun.blueprint as rrb
 
 from pse_analysis.drawing import GREEN, GREY, ORANGE, PURPLE, REASONS, SKY, SOURCES, VERMILION
 from pse_analysis.recording import stream as marks
-from pse_analysis.vocabulary import Flag, Reason, usable
+from pse_analysis.vocabulary import SEVERITY, Flag, Reason, usable
 
 if TYPE_CHECKING:
     from pse_analysis.parameters import Study
@@ -21,17 +22,19 @@ MAX_LANES = 40
 """Channels in one picture of lanes; beyond this only those with findings are shown."""
 
 MAX_SERIES = 8
+"""Channels whose samples are drawn one by one."""
 
-GOOD = "good"
-_GOOD_COLOUR = "#3A4A42"
-_FAULTS = {
-    "spike": VERMILION,
-    "stale": GREEN,
-    "lost": GREY,
-    "duplicated": PURPLE,
-    "delayed": SKY,
+GOOD, MISSED, LOST = "good", "missed", "lost"
+_QUIET = "#33403A"
+_ORIGINS = {"measured": GREEN, "held": "#3B5A50", "pseudo": ORANGE, "replaced": PURPLE}
+_AXIS = {
+    "vm_pu": "|V| [p.u.]",
+    "va_degree": "angle of V [rad]",
+    "p_mw": "P [p.u.]",
+    "q_mvar": "Q [p.u.]",
+    "i_ka": "|I| [p.u.]",
+    "ia_degree": "angle of I [rad]",
 }
-_ORIGINS = {"measured": GREEN, "held": "#4F6B60", "pseudo": ORANGE, "replaced": PURPLE}
 
 
 def validated(
@@ -57,7 +60,7 @@ def validated(
     validated, channels : DataFrame
         Tables of these names.
     truth : DataFrame, optional
-        Accepted for symmetry with the other stages; samples are compared with `sample_truth`.
+        Not drawn here: a sample is compared with `sample_truth`, the value at its own time.
     sample_truth, faults : DataFrame, optional
         Known for simulated telemetry only.
     study : Study, optional
@@ -66,33 +69,30 @@ def validated(
         Trial to draw.
     """
     del truth
-    samples = _of_trial(validated, trial)
-    injected = _of_trial(faults, trial)
-    start, end = _window(samples.time_utc, study)
-    found = samples[samples.flag > Flag.GOOD]
-    count = found.groupby("channel").size().sort_values(ascending=False, kind="stable")
-    shown = _shown(channels, count, injected)
-    plotted = [c for c in shown if c in count.index][:MAX_SERIES] or shown[:MAX_SERIES]
-    plotted = sorted(plotted, key=lambda c: -int(count.get(c, 0)))
+    samples = of_trial(validated, trial).sort_values(["channel", "time_utc"], kind="stable")
+    injected = None if faults is None else of_trial(faults, trial)
+    known = None if sample_truth is None else of_trial(sample_truth, trial)
+    window = open_on(samples.time_utc, study)
+    count = samples[samples.flag > Flag.GOOD].groupby("channel").size()
+    count = count.sort_values(ascending=False, kind="stable")
+    shown = _lanes_shown(channels, count, injected)
+    # The channels with most findings differ in nothing but bad luck: one per kind of channel first.
+    kind = channels.set_index("channel")[["source", "quantity"]].astype(str).agg(" ".join, axis=1)
+    order = list(count.index) or [str(name) for name in channels.channel]
+    turn = pd.Series(order).groupby([kind.get(name, "") for name in order]).cumcount()
+    plotted = [order[i] for i in np.argsort(turn.to_numpy(), kind="stable")][:MAX_SERIES]
 
-    axis = marks.window(start, end)
-    by_name = channels.set_index("channel")
-    series = [
-        rrb.TimeSeriesView(
-            origin=f"telemetry/{channel}",
-            name=f"{channel} [{by_name.unit.get(channel, '')}]",
-            axis_x=axis,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
-        )
-        for channel in plotted
-    ]
+    units = channels.set_index("channel").unit
+    series = []
+    for name in plotted:
+        own = samples[samples.channel == name]
+        title = f"{name.replace(':', ' ')} [{units.get(name, '')}]"
+        series.append(window.plot(marks.entity_path("telemetry", name), title, own.value))
     blueprint = marks.panels(
         rrb.Horizontal(
             rrb.Vertical(
                 rrb.Tabs(*series, name="samples"),
-                rrb.StateTimelineView(
-                    origin="flags", name="flags by channel", time_view=marks.window(start, end)
-                ),
+                window.lanes("flags", "findings by channel"),
                 row_shares=[2, 3],
             ),
             rrb.TextDocumentView(origin="text/validated", name="what was found"),
@@ -100,121 +100,137 @@ def validated(
         )
     )
     with marks.recording(path, case, blueprint) as stream:
-        for channel in plotted:
-            _series(stream, channel, samples, sample_truth, trial)
-        for channel in shown:
-            _flag_lanes(stream, channel, samples, injected, by_name, simulated=faults is not None)
-        text = _findings_text(case, trial, samples, channels, injected, faults is not None, shown)
+        for name in plotted:
+            own = samples[samples.channel == name]
+            true = None if known is None else known[known.channel == name]
+            _draw_samples(stream, name, own, true)
+        for name in shown:
+            own = samples[samples.channel == name]
+            faulty = None if injected is None else injected[injected.channel == name]
+            times, states, colours = _findings(own, faulty)
+            marks.lane(stream, marks.entity_path("flags", name), times, states, colours)
+        text = _findings_text(case, trial, samples, len(channels), injected, len(shown))
         marks.page(stream, "text/validated", text)
 
 
-def _series(stream, channel, samples, sample_truth, trial):  # type: ignore[no-untyped-def]
-    one = samples[samples.channel == channel].sort_values("time_utc", kind="stable")
-    entity = f"telemetry/{channel}"
-    known = _of_trial(sample_truth, trial)
-    if len(known):
-        true = known[known.channel == channel].sort_values("time_utc", kind="stable")
-        frame = pd.DataFrame({"true": true.value.to_numpy()}, index=true.time_utc)
+def _draw_samples(
+    stream: rr.RecordingStream, name: str, own: pd.DataFrame, true: pd.DataFrame | None
+) -> None:
+    entity = marks.entity_path("telemetry", name)
+    if true is not None and len(true):
+        line = true.sort_values("time_utc", kind="stable")
+        frame = pd.DataFrame({"true value": line.value.to_numpy()}, index=line.time_utc)
         marks.lines(stream, f"{entity}/true", frame, [marks.TRUTH], width=2.5)
-    finite = one[np.isfinite(one.value)]
-    good = finite[usable(finite.flag)]
-    bad = finite[~usable(finite.flag)]
-    for name, part, colour, size in (
-        ("usable", good, SKY, 2.0),
-        ("flagged bad", bad, VERMILION, 4.5),
+    finite = own[np.isfinite(own.value)]
+    good = usable(finite.flag)
+    for part, label, chosen, colour, size in (
+        ("usable", "usable sample", good, SKY, 2.0),
+        ("bad", "flagged bad", ~good, VERMILION, 4.0),
     ):
-        frame = pd.DataFrame({name: part.value.to_numpy()}, index=part.time_utc)
-        marks.dots(stream, f"{entity}/{name.split()[0]}", frame, [colour], size)
+        some = finite[chosen]
+        frame = pd.DataFrame({label: some.value.to_numpy()}, index=some.time_utc)
+        marks.dots(stream, f"{entity}/{part}", frame, [colour], size)
 
 
-def _flag_lanes(stream, channel, samples, injected, by_name, *, simulated):  # type: ignore[no-untyped-def]
-    one = samples[samples.channel == channel].sort_values("time_utc", kind="stable")
-    bits = one.reasons.to_numpy()
-    kinds = {int(b): _reason_text(int(b)) for b in np.unique(bits)}
-    colours = {text: _reason_colour(b) for b, text in kinds.items()}
-    states = [kinds[int(b)] for b in bits]
-    entity = f"flags/{channel}"
-    if simulated:
-        marks.lane(stream, f"{entity}/found", pd.DatetimeIndex(one.time_utc), states, colours)
-        own = injected[injected.channel == channel]
-        times, kinds_at = _intervals(own, float(by_name.period_s.get(channel, 60.0)))
-        marks.lane(stream, f"{entity}/injected", times, kinds_at, _FAULTS)
-    else:
-        marks.lane(stream, entity, pd.DatetimeIndex(one.time_utc), states, colours)
+def _findings(
+    own: pd.DataFrame, faults: pd.DataFrame | None
+) -> tuple[pd.DatetimeIndex, list[str], Mapping[str, str]]:
+    """What a channel's lane says at each of its samples.
+
+    Real telemetry shows the reasons of the checks. Where the injected faults are known the lane
+    also says which of them were found, which were missed, and which findings are false alarms.
+    """
+    bits = own.reasons.to_numpy()
+    names = {int(b): reason_text(int(b)) for b in np.unique(bits)}
+    reasons = [names[int(b)] for b in bits]
+    if faults is None:
+        colours = {text: _reason_colour(b) for b, text in names.items()}
+        return pd.DatetimeIndex(own.time_utc), reasons, colours
+    kind_of = faults.dropna(subset=["seq"]).groupby("seq").kind.agg(" + ".join)
+    kinds = kind_of.reindex(own.seq).to_numpy()
+    flagged = own.flag.to_numpy() > Flag.GOOD
+    states, colours = [], {GOOD: _QUIET, LOST: GREY}
+    for reason, kind, hit in zip(reasons, kinds, flagged, strict=True):
+        if isinstance(kind, str):
+            state = f"{kind}: {reason}" if hit else f"{kind}: {MISSED}"
+            colours[state] = GREEN if hit else VERMILION
+        elif hit:
+            state = f"false alarm: {reason}"
+            colours[state] = ORANGE
+        else:
+            state = GOOD
+        states.append(state)
+    never = faults[faults.seq.isna()]
+    times = pd.concat([own.time_utc, never.time_utc])
+    states += [LOST] * len(never)
+    order = np.argsort(times.to_numpy(), kind="stable")
+    return pd.DatetimeIndex(times.iloc[order]), [states[i] for i in order], colours
 
 
-def _intervals(faults: pd.DataFrame, period_s: float) -> tuple[pd.DatetimeIndex, list[str | None]]:
-    """Each fault as a state that lasts one period, with a gap after it unless the next follows."""
-    own = faults.sort_values("time_utc", kind="stable")
-    begin = pd.DatetimeIndex(own.time_utc)
-    period = pd.Timedelta(seconds=period_s)
-    times: list[pd.Timestamp] = []
-    states: list[str | None] = []
-    for number, (moment, kind) in enumerate(zip(begin, own.kind, strict=True)):
-        times.append(moment)
-        states.append(str(kind))
-        following = begin[number + 1] if number + 1 < len(begin) else None
-        if following is None or following > moment + 1.5 * period:
-            times.append(moment + period)
-            states.append(None)
-    return pd.DatetimeIndex(times), states
-
-
-def _reason_text(bits: int) -> str:
-    text = " + ".join(r.name.lower().replace("_", " ") for r in Reason if bits & r and r.name)
-    return text or GOOD
+def reason_text(bits: int) -> str:
+    """The reasons of a sample in words."""
+    held = [r.name.lower().replace("_", " ") for r in Reason if r.name and bits & r]
+    return " + ".join(held) or GOOD
 
 
 def _reason_colour(bits: int) -> str:
     """Colour of the gravest reason."""
-    from pse_analysis.vocabulary import SEVERITY
-
     held = [reason for reason in REASONS if bits & reason]
-    return REASONS[max(held, key=lambda r: SEVERITY[r])] if held else _GOOD_COLOUR
+    return REASONS[max(held, key=lambda reason: SEVERITY[reason])] if held else _QUIET
 
 
-def _shown(channels: pd.DataFrame, count: pd.Series, injected: pd.DataFrame) -> list[str]:
+def _lanes_shown(
+    channels: pd.DataFrame, count: pd.Series, injected: pd.DataFrame | None
+) -> list[str]:
     """Channels that get a lane, in the order of the channel table."""
-    names = [str(c) for c in channels.channel]
+    names = [str(name) for name in channels.channel]
     if len(names) <= MAX_LANES:
         return names
-    with_faults = [c for c in dict.fromkeys(injected.channel) if c not in count.index]
-    ranked = [*count.index, *with_faults][:MAX_LANES]
-    return [c for c in names if c in set(ranked)] or names[:MAX_LANES]
+    faulty = [] if injected is None else list(dict.fromkeys(injected.channel))
+    ranked = set(list(dict.fromkeys([*count.index, *faulty]))[:MAX_LANES])
+    return [name for name in names if name in ranked] or names[:MAX_LANES]
 
 
-def _findings_text(case, trial, samples, channels, injected, simulated, shown):  # type: ignore[no-untyped-def]
+def _findings_text(
+    case: str,
+    trial: int,
+    samples: pd.DataFrame,
+    n_channel: int,
+    injected: pd.DataFrame | None,
+    n_shown: int,
+) -> str:
+    bits = samples.reasons.to_numpy()
     rows = []
     for reason in REASONS:
-        hit = samples[(samples.reasons.to_numpy() & int(reason)) != 0]
+        hit = samples[(bits & int(reason)) != 0]
         if len(hit):
-            name = reason.name.lower().replace("_", " ")
-            rows.append(f"| {name} | {len(hit):,} | {hit.channel.nunique()} |")
-    flags = [f"| {flag.name.lower()} | {int((samples.flag == flag).sum()):,} |" for flag in Flag]
+            rows.append((reason_text(int(reason)), f"{len(hit):,}", f"{hit.channel.nunique()}"))
+    flags = [(flag.name.lower(), f"{int((samples.flag == flag).sum()):,}") for flag in Flag]
+    some = " (those with findings)" if n_shown < n_channel else ""
     text = [
         f"# {case}: telemetry after the checks",
-        f"Trial {trial} of this case; {len(samples):,} samples of {len(channels)} channels, "
-        f"{len(shown)} of them drawn"
-        + (" (those with most findings)." if len(shown) < len(channels) else "."),
-        "| flag | samples |\n|---|---|\n" + "\n".join(flags),
+        f"Trial {trial} of the case: {len(samples):,} samples of {n_channel} channels. "
+        f"{n_shown} channels have a lane{some}.",
+        marks.markdown_table(("flag", "samples"), flags),
+        marks.markdown_table(("reason", "samples", "channels"), rows)
+        if rows
+        else "**No sample was flagged.**",
     ]
-    if rows:
-        text.append("| reason | samples | channels |\n|---|---|---|\n" + "\n".join(rows))
+    if injected is not None:
+        sizes = injected.groupby("kind").size()
+        kinds = [(str(kind), f"{n:,}") for kind, n in sizes.items()]
+        text.append(marks.markdown_table(("injected fault", "samples"), kinds))
+        text.append("**Above**, one tab each: the channels with most findings. Small dots are "
+                    "usable samples, large vermilion dots were flagged bad, the grey line is the "
+                    "true value.")  # fmt: skip
+        text.append("**Below**, a lane per channel: *green* is an injected fault that a check "
+                    "found, *vermilion* one that was missed, *orange* a false alarm, *grey* a "
+                    "sample that never arrived.")  # fmt: skip
     else:
-        text.append("**No sample was flagged.**")
-    if simulated:
-        kinds = injected.groupby("kind").size()
-        lines = [f"| {kind} | {n:,} |" for kind, n in kinds.items()]
-        text.append("| injected fault | samples |\n|---|---|\n" + "\n".join(lines))
-    text.append(
-        "**Above:** samples of the channels with most findings, one tab each; "
-        "flagged samples are large and vermilion"
-        + (", the true value is the grey line." if simulated else ".")
-    )
-    text.append(
-        "**Below:** a lane per channel, coloured where a check found something"
-        + ("; beside it the faults that were put in." if simulated else ".")
-    )
+        text.append("**Above**, one tab each: the channels with most findings. Small dots are "
+                    "usable samples, large vermilion dots were flagged bad.")  # fmt: skip
+        text.append("**Below**, a lane per channel, coloured where a check found something. "
+                    "There is no record of true faults to compare with.")  # fmt: skip
     return "\n\n".join(text)
 
 
@@ -243,52 +259,53 @@ def aligned(
     study : Study, optional
         The plots open on its window; without it, on the whole record.
     elements : sequence of str, optional
-        Elements to plot, such as ``bus/18``; default: those with the most channels of different
-        quantities.
+        Elements to plot, such as ``bus/18``; default: four, those with a measured voltage first.
     variant : str, optional
         Variant to draw; default: the first.
     trial : int
         Trial to draw.
     """
-    table = _of_trial(aligned, trial)
+    table = of_trial(aligned, trial)
     if variant is None and len(table):
         variant = str(table.variant.iloc[0])
     table = table[table.variant == variant].merge(
         channels[["channel", "source", "quantity", "element"]], on="channel", how="left"
     )
-    start, end = _window(table.time_utc, study)
-    chosen = list(elements) if elements is not None else _metered(table)
-    quantities = {
-        element: list(dict.fromkeys(table.quantity[table.element == element]))
+    true = None if truth is None else of_trial(truth, trial)
+    window = open_on(table.time_utc, study)
+    chosen = list(elements) if elements is not None else _best_metered(table)
+    pairs = [
+        (element, str(quantity))
+        for quantity in _AXIS
         for element in chosen
-    }
-    age = table.groupby("channel").age_s.max()
-    shown = [str(c) for c in channels.channel if c in age.index]
-    if len(shown) > MAX_LANES:
-        oldest = set(age.sort_values(ascending=False, kind="stable").index[:MAX_LANES])
-        shown = [c for c in shown if c in oldest]
-
-    def plot(origin: str, name: str) -> rrb.TimeSeriesView:
-        legend = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
-        axis = marks.window(start, end)
-        return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=legend)
-
-    series = [
-        plot(f"aligned/{element}/{quantity}", f"{element} {_label(quantity)}")
-        for element in chosen
-        for quantity in quantities[element]
+        if ((table.element == element) & (table.quantity == quantity)).any()
     ]
+    series = []
+    for element, quantity in pairs:
+        own = table[(table.element == element) & (table.quantity == quantity)]
+        origin = marks.entity_path("aligned", element, quantity)
+        spread = [own.value_pu - own.sigma_pu, own.value_pu + own.sigma_pu]
+        title = f"{element.replace('/', ' ')} {_AXIS[quantity]}"
+        series.append(window.plot(origin, title, pd.concat(spread)))
+    sources = [source for source in SOURCES if (table.source == source).any()]
+    by_source = table.pivot_table(
+        index="time_utc", columns="source", values="age_s", aggfunc=["count", "mean"]
+    )
+    number = by_source["count"].reindex(columns=sources).fillna(0.0)
+    age = by_source["mean"].reindex(columns=sources)
+    oldest = table.groupby("channel").age_s.mean().sort_values(ascending=False, kind="stable")
+    few = set(oldest.index[:MAX_LANES])
+    shown = [str(name) for name in channels.channel if name in few]
+
     blueprint = marks.panels(
         rrb.Horizontal(
             rrb.Vertical(
                 rrb.Tabs(*series, name="values"),
                 rrb.Horizontal(
-                    plot("available", "channels with a value at the instant"),
-                    plot("age", "mean age of the values [s]"),
+                    window.plot("available", "channels with a value", number, zero=True),
+                    window.plot("age", "mean age of the values [s]", age, zero=True),
                 ),
-                rrb.StateTimelineView(
-                    origin="origin", name="origin by channel", time_view=marks.window(start, end)
-                ),
+                window.lanes("origin", "origin by channel"),
                 row_shares=[4, 3, 5],
             ),
             rrb.TextDocumentView(origin="text/aligned", name="what the instants hold"),
@@ -296,91 +313,91 @@ def aligned(
         )
     )
     with marks.recording(path, case, blueprint) as stream:
-        for element in chosen:
-            for quantity in quantities[element]:
-                _aligned_series(stream, table, element, quantity, _of_trial(truth, trial))
-        sources = [s for s in SOURCES if s in set(table.source)]
-        number = table.pivot_table(index="time_utc", columns="source", values="channel",
-                                   aggfunc="count")  # fmt: skip
-        mean_age = table.pivot_table(index="time_utc", columns="source", values="age_s")
-        colours = [SOURCES[s] for s in sources]
-        if sources:
-            marks.lines(stream, "available", number[sources].fillna(0.0), colours)
-            marks.lines(stream, "age", mean_age[sources], colours)
-        instants = pd.DatetimeIndex(np.sort(table.time_utc.unique()))
-        for channel in shown:
-            one = table[table.channel == channel].set_index("time_utc").origin
-            states = [s if isinstance(s, str) else None for s in one.reindex(instants)]
-            marks.lane(stream, f"origin/{channel}", instants, states, _ORIGINS)
-        text = _aligned_text(case, trial, variant, table, channels, shown, truth is not None)
+        for element, quantity in pairs:
+            own = table[(table.element == element) & (table.quantity == quantity)]
+            _draw_aligned(stream, marks.entity_path("aligned", element, quantity), own, true)
+        colours = [SOURCES[source] for source in sources]
+        marks.lines(stream, "available", number, colours, width=2.0)
+        marks.lines(stream, "age", age, colours, width=2.0)
+        instants = pd.DatetimeIndex(table.time_utc.drop_duplicates().sort_values())
+        for name in shown:
+            own = table[table.channel == name].set_index("time_utc").origin.reindex(instants)
+            states = own.fillna("").tolist()
+            marks.lane(stream, marks.entity_path("origin", name), instants, states, _ORIGINS)
+        text = _aligned_text(case, trial, variant, table, len(channels), len(shown), true)
         marks.page(stream, "text/aligned", text)
 
 
-def _aligned_series(stream, table, element, quantity, truth):  # type: ignore[no-untyped-def]
-    entity = f"aligned/{element}/{quantity}"
-    # Only |V| has the same unit in both tables: p.u. of the grid's own base.
-    true = truth[(truth.element == element) & (truth.quantity == quantity)] if len(truth) else truth
-    if quantity == "vm_pu" and len(true):
-        frame = pd.DataFrame({"true": true.value.to_numpy()}, index=true.time_utc)
+def _draw_aligned(
+    stream: rr.RecordingStream, entity: str, own: pd.DataFrame, true: pd.DataFrame | None
+) -> None:
+    quantity = own.quantity.iloc[0]
+    # Of the true values only |V| has the unit of the aligned ones without knowing the base power.
+    if true is not None and quantity == "vm_pu":
+        line = true[(true.element == own.element.iloc[0]) & (true.quantity == quantity)]
+        frame = pd.DataFrame({"true value": line.value.to_numpy()}, index=line.time_utc)
         marks.lines(stream, f"{entity}/true", frame, [marks.TRUTH], width=2.5)
-    own = table[(table.element == element) & (table.quantity == quantity)]
     for channel, one in own.groupby("channel", sort=False):
-        source = str(one.source.iloc[0])
-        colour = SOURCES.get(source, GREY)
+        source, *_, last = str(channel).split(":")
+        label = source if last == quantity and ":from:" not in str(channel) else str(channel)
         line = one.set_index("time_utc").sort_index()
-        name = str(channel).split(":")[0]
-        marks.band(stream, f"{entity}/{name}", line.value_pu, line.sigma_pu, name, colour, "p.u.")
+        colour = SOURCES.get(str(one.source.iloc[0]), GREY)
+        where = marks.entity_path(entity, str(channel))
+        marks.band(stream, where, line.value_pu, line.sigma_pu, f"{label} ±σ", colour)
 
 
-def _label(quantity: str) -> str:
-    return {
-        "vm_pu": "|V| [p.u.]",
-        "va_degree": "angle [rad]",
-        "p_mw": "P [p.u.]",
-        "q_mvar": "Q [p.u.]",
-        "i_ka": "|I| [p.u.]",
-        "ia_degree": "angle of I [rad]",
-    }.get(quantity, quantity)
-
-
-def _aligned_text(case, trial, variant, table, channels, shown, simulated):  # type: ignore[no-untyped-def]
-    rows = []
-    for source, part in table.groupby("source", sort=False):
-        share = (part.origin == "measured").mean()
-        rows.append(
-            f"| {source} | {part.channel.nunique()} | {len(part):,} | {100 * share:.0f} % "
-            f"| {part.age_s.mean():.0f} s | {part.age_s.max():.0f} s |"
+def _aligned_text(
+    case: str,
+    trial: int,
+    variant: str | None,
+    table: pd.DataFrame,
+    n_channel: int,
+    n_shown: int,
+    true: pd.DataFrame | None,
+) -> str:
+    rows = [
+        (
+            str(source),
+            f"{part.channel.nunique()}",
+            f"{len(part):,}",
+            f"{100 * float((part.origin == 'measured').mean()):.0f} %",
+            f"{part.age_s.mean():.0f} s",
+            f"{part.age_s.max():.0f} s",
         )
+        for source, part in table.groupby("source", sort=False)
+    ]
+    some = " (those with the oldest values)" if n_shown < table.channel.nunique() else ""
+    head = ("source", "channels", "values", "new", "mean age", "oldest")
     return "\n\n".join(
         [
             f"# {case}: values at the instants",
-            f"Trial {trial}, variant `{variant}`: {table.time_utc.nunique():,} instants, "
-            f"{table.channel.nunique()} of {len(channels)} channels ever have a value; "
-            f"{len(shown)} are drawn.",
-            "| source | channels | values | measured | mean age | oldest |\n|---|---|---|---|---|---|\n"
-            + "\n".join(rows),
-            "**Above:** values with their ±σ band, which grows with age"
-            + ("; the true voltage is the grey line." if simulated else "."),
-            "**Middle:** how many channels have a value, and how old it is.",
-            "**Below:** where each value comes from; a gap means there was none young enough.",
+            f"Trial {trial} of the case, variant `{variant}`: {table.time_utc.nunique():,} "
+            f"instants. {table.channel.nunique()} of {n_channel} channels ever have a value; "
+            f"{n_shown} have a lane{some}.",
+            marks.markdown_table(head, rows),
+            "**Above**, one tab each: values in per unit with their ±σ band, which grows with age."
+            + ("" if true is None else " The grey line is the true voltage."),
+            "**Middle**: how many channels of each source have a value, and how old it is.",
+            "**Below**, a lane per channel: bright green is a new measurement, dark green one that "
+            "is used again; a gap means that no value was young enough.",
         ]
     )
 
 
-def _metered(table: pd.DataFrame, limit: int = 4) -> list[str]:
+def _best_metered(table: pd.DataFrame, limit: int = 4) -> list[str]:
     """Elements with a measured voltage first, then those with most quantities."""
     kinds = table.groupby("element", sort=False).quantity.unique()
     rank = {str(e): ("vm_pu" in set(q), len(q)) for e, q in kinds.items()}
-    return sorted(rank, key=lambda e: rank[e], reverse=True)[:limit]
+    return sorted(rank, key=lambda element: rank[element], reverse=True)[:limit]
 
 
-def _of_trial(table: pd.DataFrame | None, trial: int) -> pd.DataFrame:
-    if table is None:
-        return pd.DataFrame({"channel": [], "kind": [], "time_utc": []})
+def of_trial(table: pd.DataFrame, trial: int) -> pd.DataFrame:
+    """Rows of one trial."""
     return table[table.trial == trial]
 
 
-def _window(times: pd.Series, study: Study | None) -> tuple[pd.Timestamp, pd.Timestamp]:
+def open_on(times: pd.Series, study: Study | None) -> marks.Window:
+    """The study window, or everything there is where no study is given."""
     if study is not None:
-        return pd.Timestamp(study.start), pd.Timestamp(study.end)
-    return times.min(), times.max()
+        return marks.Window(pd.Timestamp(study.start), pd.Timestamp(study.end))
+    return marks.Window(times.min(), times.max())
