@@ -304,6 +304,7 @@ def schema(table: str) -> pa.DataFrameSchema:
             "channel": col(str),
             "value_pu": col("float64"),
             "sigma_pu": col("float64", pa.Check.gt(0)),
+            "sigma_age_pu": col("float64", pa.Check.ge(0)),
             "origin": col(str, one_of(Origin)),
             "sample_utc": col(utc),
             "time_confidence": col("float64", pa.Check.in_range(0, 1)),

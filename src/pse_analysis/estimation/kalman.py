@@ -1,0 +1,284 @@
+"""Kalman filter on the linear rectangular model, with the recent past in its state.
+
+A sample is rarely taken at the instant it is used at: a meter reports the mean of the last quarter of
+an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last K instants
+beside the present one, and reads a sample through the weights with which its interval covers them,
+by linear interpolation between instants. What interpolation leaves out, the movement inside a step,
+is added to the sample's variance. So a sample enters once, where it belongs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg
+
+from pse_analysis.errors import Unobservable
+from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
+from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import RectangularModel, SensorLayout
+from pse_analysis.vocabulary import Status
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+BoolArray = npt.NDArray[np.bool_]
+
+REFINE_PU = 1e-3
+"""The measurements are transformed again if an update moves a voltage by more than this. [p.u.]"""
+MAX_PASSES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanState:
+    """State of the filter.
+
+    Attributes
+    ----------
+    x : ((K+1)·2N,) ndarray
+        [e; f] now, one step ago, …, K steps ago. [p.u.]
+    P : ((K+1)·2N, (K+1)·2N) ndarray
+        Its covariance.
+    """
+
+    x: FloatArray
+    P: FloatArray  # noqa: N815 (the field's letter)
+
+
+def predict(state: KalmanState, noise: FloatArray) -> KalmanState:
+    """One step of the random walk: the present gets Q, every older state moves back by one."""
+    n = noise.shape[0]
+    source = (
+        np.concatenate([np.arange(n), np.arange(len(state.x) - n)])
+        if len(state.x) > n
+        else np.arange(n)
+    )
+    x = state.x[source]
+    covariance = state.P[np.ix_(source, source)]
+    covariance[:n, :n] += noise
+    return KalmanState(x, covariance)
+
+
+def update(
+    state: KalmanState, H: FloatArray, z: FloatArray, variance: FloatArray
+) -> tuple[KalmanState, FloatArray, FloatArray, float]:
+    """Condition on z = H x + v with independent v.
+
+    Parameters
+    ----------
+    state : KalmanState
+    H : (m, n) ndarray
+    z, variance : (m,) ndarray
+
+    Returns
+    -------
+    state : KalmanState
+    innovation : (m,) ndarray
+        η = z - H x.
+    sigma_innovation : (m,) ndarray
+        √S_ii.
+    nis : float
+        ηᵀS⁻¹η.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If S is not positive definite.
+    """
+    innovation = z - H @ state.x
+    HP = H @ state.P
+    S = HP @ H.T
+    S[np.diag_indices_from(S)] += variance
+    chol_S = linalg.cholesky(S, lower=True, check_finite=False)
+    white = linalg.solve_triangular(chol_S, innovation, lower=True, check_finite=False)
+    # P - K S Kᵀ = P - WᵀW with W = chol(S)⁻¹ H P: one symmetric product.
+    W = linalg.solve_triangular(chol_S, HP, lower=True, check_finite=False)
+    return (
+        KalmanState(state.x + W.T @ white, state.P - W.T @ W),
+        innovation,
+        np.sqrt(np.diagonal(S)),
+        float(white @ white),
+    )
+
+
+def interval_weights(
+    age_s: FloatArray, window_s: FloatArray, step_s: float, lags: int
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """How samples that end ``age_s`` ago and average ``window_s`` read the states of the last steps.
+
+    Parameters
+    ----------
+    age_s, window_s : (m,) ndarray
+        [s]
+    step_s : float
+        [s]
+    lags : int
+        K, the oldest state kept.
+
+    Returns
+    -------
+    weights : (m, K+1) ndarray
+        Of the present, one step ago, …; rows sum to 1.
+    inside : (m,) ndarray
+        Variance of what linear interpolation leaves out, as a multiple of the variance of one step
+        of a random walk: u(1-u) for an instant a fraction u into a step, and 1/12 of a step's share
+        squared for a mean over it.
+    covered : (m,) ndarray of bool
+        Whether the interval lies inside the last K steps; the other rows mean nothing.
+    """
+    near, width = np.asarray(age_s) / step_s, np.asarray(window_s) / step_s
+    far = near + width
+    covered = far <= lags + 1e-9
+    lag = np.arange(lags + 1)
+    instant = width < 1e-9
+    hat = np.maximum(0.0, 1.0 - np.abs(near[:, None] - lag))
+    safe = np.where(instant, 1.0, width)[:, None]
+    mean = (_hat_integral(far[:, None] - lag) - _hat_integral(near[:, None] - lag)) / safe
+    weights = np.where(instant[:, None], hat, mean)
+    fraction = near - np.floor(near)
+    step = np.arange(max(lags, 1))
+    begin = np.clip(near[:, None] - step, 0.0, 1.0)
+    end = np.clip(far[:, None] - step, 0.0, 1.0)
+    span = end - begin
+    # ∫∫ [min(u, v) - uv] du dv over the part of a step that the window covers: a Brownian bridge.
+    bridge = begin * span**2 + span**3 / 3.0 - 0.25 * (end**2 - begin**2) ** 2
+    inside = np.where(instant, fraction * (1.0 - fraction), bridge.sum(axis=1) / safe[:, 0] ** 2)
+    return weights, inside, covered
+
+
+def _hat_integral(u: FloatArray) -> FloatArray:
+    """∫ max(0, 1-|v|) dv from -∞ to u."""
+    u = np.clip(u, -1.0, 1.0)
+    return np.where(u < 0, 0.5 * (1 + u) ** 2, 1.0 - 0.5 * (1 - u) ** 2)
+
+
+def kalman_filter(
+    name: str,
+    network: Network,
+    layout: SensorLayout,
+    noise: ProcessNoise,
+    *,
+    step_s: float,
+    delay_s: float = 0.0,
+) -> Estimator:
+    """Kalman filter with F = I on the linear rectangular model.
+
+    Parameters
+    ----------
+    name : str
+        Of the method.
+    network : Network
+    layout : SensorLayout
+    noise : ProcessNoise
+        Q of the step to an instant.
+    step_s : float
+        Step between instants. [s]
+    delay_s : float
+        Largest age at which a sample that averages an interval arrives; with the longest interval
+        it sets how many past states are kept. [s]
+
+    Returns
+    -------
+    Estimator
+        It starts from a weighted least-squares estimate and uses every sample once.
+
+    Notes
+    -----
+    Eqs. (25)–(29) of [qi2025] with constant H where all samples are instantaneous and of full age 0.
+    """
+    model = RectangularModel(network, layout)
+    wls = WeightedLeastSquares(network, layout)
+    n2 = 2 * network.n_bus
+    reach = float(np.max(layout.window_s, initial=0.0)) + delay_s
+    lags = int(np.ceil(reach / step_s - 1e-9))
+    # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
+    held = None if layout.has_angle else network.n_bus + network.slack
+
+    def process(voltage: ComplexArray, time: np.datetime64) -> FloatArray:
+        covariance = noise(voltage, time)
+        if held is not None:
+            covariance = covariance.copy()
+            covariance[held, :] = covariance[:, held] = 0.0
+        return covariance
+
+    def init(snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
+        m = len(layout)
+        try:
+            solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available)
+        except Unobservable as error:
+            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
+        if not solution.converged:
+            return None, Info.nothing(m, Status.NOT_CONVERGED, "no start from least squares")
+        n = network.n_bus
+        voltage = solution.x[n:] * np.exp(1j * solution.x[:n])
+        turn = to_rectangular(voltage)
+        start = turn @ solution.covariance() @ turn.T
+        walk = process(voltage, snapshot.time)
+        # Backwards the random walk spreads again: Cov(x₋ⱼ, x₋ₖ) = P₀ + min(j, k) Q.
+        older = np.minimum.outer(np.arange(lags + 1), np.arange(lags + 1))
+        covariance = np.kron(np.ones_like(older), start) + np.kron(older, walk)
+        x = np.tile(np.concatenate([voltage.real, voltage.imag]), lags + 1)
+        used = snapshot.available
+        info = Info(
+            Status.OK,
+            solution.iterations,
+            np.nan,
+            0,
+            used,
+            np.where(used, solution.residual, np.nan),
+            np.where(used, snapshot.sigma, np.nan),
+            np.zeros(m),
+        )
+        return KalmanState(x, covariance), info
+
+    def step(state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
+        m = len(layout)
+        before = _voltage(state.x, network.n_bus)
+        walk = process(before, snapshot.time)
+        prior = predict(state, walk)
+        weights, inside, covered = interval_weights(snapshot.age_s, layout.window_s, step_s, lags)
+        used = snapshot.available & snapshot.fresh & covered
+        if not used.any():
+            return prior, Info.nothing(m, Status.PREDICTED)
+        rows = np.flatnonzero(used)
+        sigma = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
+        at = before
+        for passes in range(1, MAX_PASSES + 1):
+            H, z, spread = model.rows(snapshot.z, sigma, used, at)
+            H, z, spread = H[rows].toarray(), z[rows], spread[rows]
+            moved = np.einsum("ij,ij->i", H @ walk, H)
+            variance = spread**2 + inside[rows] * moved
+            lagged = (weights[rows][:, :, None] * H[:, None, :]).reshape(len(rows), -1)
+            try:
+                posterior, innovation, deviation, nis = update(prior, lagged, z, variance)
+            except np.linalg.LinAlgError:
+                return None, Info.nothing(
+                    m,
+                    Status.DIVERGED,
+                    "the innovation's covariance is not positive definite: the filter starts "
+                    "again from least squares",
+                )
+            after = _voltage(posterior.x, network.n_bus)
+            if np.abs(after - at).max() < REFINE_PU:
+                break
+            at = after
+        full = np.full((2, m), np.nan)
+        full[0, rows], full[1, rows] = innovation, deviation
+        return posterior, Info(
+            Status.OK, passes, nis, len(rows), used, full[0], full[1], np.zeros(m)
+        )
+
+    def read(state: KalmanState) -> Voltages:
+        voltage = _voltage(state.x, network.n_bus)
+        turn = to_polar(voltage)
+        covariance = turn @ state.P[:n2, :n2] @ turn.T
+        return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
+
+    return Estimator(name, init, step, read)
+
+
+def _voltage(x: FloatArray, n_bus: int) -> ComplexArray:
+    return np.asarray(x[:n_bus] + 1j * x[n_bus : 2 * n_bus])

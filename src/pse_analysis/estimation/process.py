@@ -1,0 +1,339 @@
+"""How the state may move between two instants: process noise of the random walk x⁺ = x + w.
+
+``scalar`` noise moves every voltage on its own. ``load`` noise moves the loads and the source and
+lets the grid carry that to the voltages, Q = S Σ_load Sᵀ + s sᵀ σ²_source, where S = ∂x/∂(P, Q) and
+s = ∂x/∂|V_source| at the forecast: on a feeder, where a change of load moves all voltages together,
+only the latter can be calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg, optimize, signal
+
+from pse_analysis.estimation.estimator import Record
+from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.grid.power_flow import solve
+from pse_analysis.measurement import (
+    BUS,
+    VM,
+    MeasurementModel,
+    P,
+    Q,
+    SensorLayout,
+    standard_deviation,
+)
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+ProcessNoise = Callable[[ComplexArray, np.datetime64], FloatArray]
+"""Covariance of x = [e; f] added by the step to an instant, (2N, 2N), at a forecast voltage."""
+
+DAY_S = 86400.0
+
+
+def scalar_noise(network: Network, variance: float) -> ProcessNoise:
+    """Q = q·I: every voltage moves on its own. [p.u.²]"""
+    noise = variance * np.eye(2 * network.n_bus)
+    return lambda _voltage, _time: noise
+
+
+@dataclass(frozen=True, eq=False)
+class LoadStatistics:
+    """How much the injections and the source voltage move in one step, learnt from history.
+
+    Attributes
+    ----------
+    deviation : (n_slot, 2N) ndarray
+        σ of the change of [P; Q] in one step, by slot of the day. [p.u.]
+    correlation : (2N, 2N) ndarray
+        Correlation of these changes.
+    source : float
+        σ of the change of the source voltage in one step. [p.u.]
+    slot_s : float
+        Length of a slot. [s]
+    """
+
+    deviation: FloatArray
+    correlation: FloatArray
+    source: float
+    slot_s: float
+
+    def covariance(self, time: np.datetime64) -> FloatArray:
+        """Σ_load of the step to an instant. (2N, 2N) [p.u.²]"""
+        second = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "s")
+        deviation = self.deviation[int(second // self.slot_s) % len(self.deviation)]
+        return np.asarray(self.correlation * np.outer(deviation, deviation))
+
+
+class Sensitivity:
+    """S and s: how the voltages of a grid follow its injections and its held voltages.
+
+    Parameters
+    ----------
+    network : Network
+
+    Notes
+    -----
+    With the rows of the power flow split by its unknowns u and held voltages v, J_u du + J_v dv = dS,
+    so S = J_u⁻¹ and s = -J_u⁻¹ J_v.
+    """
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        n, kind = network.n_bus, network.buses.kind
+        angle = np.flatnonzero(np.arange(n) != network.slack)
+        size = np.flatnonzero(kind == BusKind.PQ)
+        self.held = np.flatnonzero(kind != BusKind.PQ)
+        self.inputs = np.concatenate([angle, n + size])  # rows of [P; Q] that are given
+        self._unknown = np.concatenate([angle, n + size])  # rows of [θ; |V|] that follow
+        layout = SensorLayout.of(network, (P, angle, BUS), (Q, size, BUS))
+        self._model = MeasurementModel(network, layout)
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """∂[θ; |V|]/∂[P; Q] and ∂[θ; |V|]/∂|V_held| at a state.
+
+        Returns
+        -------
+        (2N, 2N) ndarray
+            Columns of injections that do not count (the slack's, and Q of held buses) are zero.
+        (2N, n_held) ndarray
+        """
+        n = self.network.n_bus
+        jacobian = self._model.jacobian(x).toarray()
+        right = np.concatenate([np.eye(len(self.inputs)), -jacobian[:, n + self.held]], axis=1)
+        solved = linalg.solve(jacobian[:, self._unknown], right)
+        by_input = np.zeros((2 * n, 2 * n))
+        by_input[np.ix_(self._unknown, self.inputs)] = solved[:, : len(self.inputs)]
+        by_voltage = np.zeros((2 * n, len(self.held)))
+        by_voltage[self._unknown] = solved[:, len(self.inputs) :]
+        by_voltage[n + self.held, np.arange(len(self.held))] = 1.0
+        return by_input, by_voltage
+
+
+def to_rectangular(voltage: ComplexArray) -> FloatArray:
+    """∂[e; f]/∂[θ; |V|] at a voltage. (2N, 2N)"""
+    direction = voltage / np.abs(voltage)
+    return np.block(
+        [
+            [np.diag(-voltage.imag), np.diag(direction.real)],
+            [np.diag(voltage.real), np.diag(direction.imag)],
+        ]
+    )
+
+
+def to_polar(voltage: ComplexArray) -> FloatArray:
+    """∂[θ; |V|]/∂[e; f] at a voltage. (2N, 2N)"""
+    size = np.abs(voltage)
+    return np.block(
+        [
+            [np.diag(-voltage.imag / size**2), np.diag(voltage.real / size**2)],
+            [np.diag(voltage.real / size), np.diag(voltage.imag / size)],
+        ]
+    )
+
+
+def load_noise(network: Network, statistics: LoadStatistics) -> ProcessNoise:
+    """Load changes carried through the grid: Q = S Σ_load Sᵀ + s sᵀ σ²_source. [p.u.²]
+
+    The sensitivities are renewed when a voltage has moved by more than 1e-3 p.u. since the last
+    time, which changes them by less than 1 %.
+    """
+    sensitivity = Sensitivity(network)
+    kept: dict[str, npt.NDArray[np.generic]] = {}
+
+    def noise(voltage: ComplexArray, time: np.datetime64) -> FloatArray:
+        if "at" not in kept or np.abs(kept["at"] - voltage).max() > 1e-3:
+            turn = to_rectangular(voltage)
+            by_input, by_voltage = sensitivity.at(
+                np.concatenate([np.angle(voltage), np.abs(voltage)])
+            )
+            kept["at"] = voltage
+            kept["load"] = (turn @ by_input)[:, sensitivity.inputs]
+            kept["source"] = turn @ by_voltage
+        spread, source = kept["load"], kept["source"] * statistics.source
+        moved = np.ix_(sensitivity.inputs, sensitivity.inputs)
+        return np.asarray(
+            spread @ statistics.covariance(time)[moved] @ spread.T + source @ source.T
+        )
+
+    return noise
+
+
+# --------------------------------------------------------------------------------------------------
+# Learning from history
+# --------------------------------------------------------------------------------------------------
+
+
+def learn_load(
+    history: Record,
+    layout: SensorLayout,
+    network: Network,
+    step_s: float,
+    *,
+    slot_s: float = 900.0,
+    bandwidth_s: float = 5400.0,
+    source: float | None = None,
+) -> LoadStatistics:
+    """Learn how injections and the source voltage move from telemetry before the study.
+
+    Parameters
+    ----------
+    history : Record
+        Aligned telemetry before the first estimated instant.
+    layout : SensorLayout
+    network : Network
+    step_s : float
+        Step between instants. [s]
+    slot_s, bandwidth_s : float
+        Slots of the day, and how far (Gaussian) each one looks at its neighbours. [s]
+    source : float, optional
+        σ of the source voltage's change per step; learnt if not given. [p.u.]
+
+    Returns
+    -------
+    LoadStatistics
+        Injections without a meter move by the median relative change of the metered ones.
+
+    Notes
+    -----
+    Increments of a random walk with variance rate r, sampled every T as means over W, have variance
+    r (T - W/3); twice the meter's own variance is taken off first. The correlation is shrunk towards
+    the identity by the intensity that Schäfer and Strimmer (2005) derive from its sampling variance.
+    """
+    n = network.n_bus
+    slots = round(DAY_S / slot_s)
+    rows = np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS))
+    deviation = np.full((slots, 2 * n), np.nan)
+    standard, where = [], []
+    for row in rows:
+        use = np.flatnonzero(history.fresh[:, row])
+        place = layout.position[row] + (n if layout.quantity[row] == Q else 0)
+        if len(use) < 12 or not np.isnan(deviation[0, place]):
+            continue
+        change = np.diff(history.z[use, row])
+        elapsed = np.diff(history.time[use]) / np.timedelta64(1, "s")
+        change, elapsed, use = change[elapsed > 0], elapsed[elapsed > 0], use[1:][elapsed > 0]
+        usual = np.median(elapsed)
+        regular = elapsed < 1.5 * usual
+        sigma = standard_deviation(history.z[use, row], layout.sigma[row], layout.relative[row])
+        meter = 2.0 * float(np.mean(sigma**2))
+        of_day = _second_of_day(history.time[use])
+        square = _by_slot(change[regular] ** 2, of_day[regular], slots, slot_s, bandwidth_s)
+        moving = np.maximum(square - meter, 0.1 * square)
+        rate = moving / (usual - layout.window_s[row] / 3.0)
+        deviation[:, place] = np.sqrt(rate * step_s)
+        panel = np.full(len(history.time), np.nan)
+        slot = (of_day // slot_s).astype(int) % slots
+        panel[use[regular]] = change[regular] / np.sqrt(square[slot[regular]])
+        standard.append(panel)
+        where.append(place)
+    correlation = np.eye(2 * n)
+    if where:
+        index = np.ix_(where, where)
+        correlation[index] = _shrunk_correlation(np.array(standard).T)
+    _fill_unmetered(deviation, network)
+    if source is None:
+        source = learn_source(history, layout, network, deviation)
+    return LoadStatistics(deviation, correlation, source, slot_s)
+
+
+def _second_of_day(time: npt.NDArray[np.datetime64]) -> FloatArray:
+    return np.asarray((time - time.astype("datetime64[D]")) / np.timedelta64(1, "s"))
+
+
+def _by_slot(
+    square: FloatArray, of_day: FloatArray, slots: int, slot_s: float, bandwidth_s: float
+) -> FloatArray:
+    """Mean square by slot of the day, smoothed around the clock and shrunk towards the day's mean."""
+    centre = (np.arange(slots) + 0.5) * slot_s
+    apart = np.abs(centre[:, None] - of_day[None, :])
+    apart = np.minimum(apart, DAY_S - apart)
+    weight = np.exp(-0.5 * (apart / bandwidth_s) ** 2)
+    local = weight @ square / weight.sum(axis=1)
+    effective = weight.sum(axis=1) ** 2 / (weight**2).sum(axis=1)
+    trust = effective / (effective + 5.0)
+    return np.asarray(np.maximum(trust * local + (1 - trust) * square.mean(), 1e-16))
+
+
+def _shrunk_correlation(panel: FloatArray) -> FloatArray:
+    """Correlation of the columns of (n_time, k) values with gaps, shrunk to be positive definite."""
+    full = panel[np.isfinite(panel).all(axis=1)]
+    k = panel.shape[1]
+    if len(full) < 8:
+        return np.eye(k)
+    centred = (full - full.mean(axis=0)) / full.std(axis=0)
+    count = len(centred)
+    sample = centred.T @ centred / count
+    fourth = (centred**2).T @ centred**2 / count
+    spread = (fourth - sample**2) / (count - 1)
+    off = ~np.eye(k, dtype=bool)
+    strength = float(np.clip(spread[off].sum() / max((sample[off] ** 2).sum(), 1e-300), 0.05, 1.0))
+    shrunk = (1.0 - strength) * sample
+    np.fill_diagonal(shrunk, 1.0)
+    return np.asarray(shrunk)
+
+
+def _fill_unmetered(deviation: FloatArray, network: Network) -> None:
+    """Give injections without a meter the median relative change of those that have one."""
+    nominal = np.abs(np.concatenate([network.p_nominal_pu, network.q_nominal_pu]))
+    metered = ~np.isnan(deviation[0])
+    known = metered & (nominal > 0)
+    relative = (
+        np.median(deviation[:, known] / nominal[known], axis=1) if known.any() else np.array([0.02])
+    )
+    rest = np.flatnonzero(~metered)
+    deviation[:, rest] = relative[:, None] * nominal[rest]
+
+
+def learn_source(
+    history: Record, layout: SensorLayout, network: Network, deviation: FloatArray
+) -> float:
+    """Learn σ of the source voltage's change per step as a local level under measurement noise.
+
+    Every voltage reading, less the part that the metered injections explain (by the sensitivities at
+    the nominal state), reads the source; their mean follows a random walk plus noise, whose variance
+    ratio is found by maximum likelihood.
+
+    Returns
+    -------
+    float
+        1e-3 p.u. if there are fewer than 24 instants with a voltage reading. [p.u.]
+    """
+    n = network.n_bus
+    rows = np.flatnonzero(layout.quantity == VM)
+    injections = np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS))
+    fresh = history.fresh[:, rows]
+    if not len(rows) or (fresh.any(axis=1)).sum() < 24:
+        return 1e-3
+    by_input, _ = Sensitivity(network).at(solve(network).x)
+    explained = np.zeros((len(history.time), n))
+    for row in injections:
+        place = layout.position[row] + (n if layout.quantity[row] == Q else 0)
+        seen = history.available[:, row]
+        level = history.z[seen, row].mean() if seen.any() else 0.0
+        value = np.where(seen, history.z[:, row], level)
+        explained += np.outer(value, by_input[n:, place])
+    reading = history.z[:, rows] - explained[:, layout.position[rows]]
+    reading = reading - np.nanmean(np.where(fresh, reading, np.nan), axis=0)
+    count = fresh.sum(axis=1)
+    level = np.where(fresh, reading, 0.0).sum(axis=1)[count > 0] / count[count > 0]
+    meter = float(np.mean(layout.sigma[rows] ** 2) / np.mean(count[count > 0]))
+
+    def cost(log_ratio: float) -> float:
+        # Steady-state Kalman filter of a local level: innovations by one recursive filter.
+        ratio = np.exp(log_ratio)
+        prior = 0.5 * (ratio + np.sqrt(ratio**2 + 4.0 * ratio))
+        gain = prior / (prior + 1.0)
+        forecast = signal.lfilter([gain], [1.0, gain - 1.0], level, zi=[(1 - gain) * level[0]])[0]
+        innovation = level[1:] - forecast[:-1]
+        variance = meter * (prior + 1.0)
+        return float(np.sum(innovation**2) / variance + len(innovation) * np.log(variance))
+
+    found = optimize.minimize_scalar(cost, bounds=(-12.0, 4.0), method="bounded")
+    return float(np.sqrt(meter * np.exp(found.x)))

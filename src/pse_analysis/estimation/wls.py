@@ -1,0 +1,335 @@
+"""Weighted least squares on one snapshot: sparse Gauss-Newton in polar coordinates.
+
+The rows are whitened (divided by σ) once per iteration, the gain is assembled on a pattern that is
+known in advance, and one factorisation gives the step, and at the end the covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+
+from pse_analysis.errors import Unobservable
+from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import IA, IM, MeasurementModel, SensorLayout
+from pse_analysis.vocabulary import Status
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+def state_columns(network: Network, layout: SensorLayout) -> npt.NDArray[np.int64]:
+    """Columns of [θ; |V|] to be estimated.
+
+    All of them where the layout measures an angle against an outside reference; otherwise all but
+    the slack's angle, which is then the reference.
+    """
+    columns = np.arange(2 * network.n_bus)
+    return columns if layout.has_angle else np.delete(columns, network.slack)
+
+
+@dataclass(frozen=True, eq=False)
+class WlsSolution:
+    """A weighted least-squares estimate.
+
+    Attributes
+    ----------
+    x : (2N,) ndarray
+        [θ; |V|]. [rad; p.u.]
+    residual : (m,) ndarray
+        z - h(x); NaN where nothing was measured.
+    objective : float
+        Sum of the squared whitened residuals, χ² with m - n degrees of freedom.
+    iterations : int
+    converged : bool
+    """
+
+    x: FloatArray
+    residual: FloatArray
+    objective: float
+    iterations: int
+    converged: bool
+    _gain: _Gain
+    _columns: npt.NDArray[np.int64]
+
+    def covariance(self) -> FloatArray:
+        """Covariance of [θ; |V|], zero where a column is fixed. (2N, 2N)"""
+        full = np.zeros((len(self.x), len(self.x)))
+        full[np.ix_(self._columns, self._columns)] = self._gain.inverse()
+        return full
+
+
+class _Gain:
+    """JᵀR⁻¹J, assembled on a known pattern and factorised."""
+
+    def __init__(self, model: MeasurementModel) -> None:
+        _, n = model.shape
+        count = np.diff(model.indptr)
+        # All pairs of entries that share a row: each adds one product to the gain.
+        self._left = np.repeat(np.arange(len(model.indices)), count[model.row_of_entry])
+        first = model.indptr[model.row_of_entry]
+        span = count[model.row_of_entry]
+        offset = np.arange(span.sum()) - np.repeat(np.cumsum(span) - span, span)
+        self._right = np.repeat(first, span) + offset
+        code = model.indices[self._right].astype(np.int64) * n + model.indices[self._left]
+        places, self._place = np.unique(code, return_inverse=True)
+        self._indices = (places % n).astype(np.int32)
+        self._indptr = np.searchsorted(places // n, np.arange(n + 1)).astype(np.int32)
+        self._n = n
+        self.factor: sparse_linalg.SuperLU | None = None
+
+    def factorise(self, whitened: FloatArray) -> None:
+        """Factorise the gain of whitened Jacobian entries.
+
+        Raises
+        ------
+        Unobservable
+            If the gain is numerically singular.
+        """
+        data = np.bincount(
+            self._place,
+            weights=whitened[self._left] * whitened[self._right],
+            minlength=len(self._indices),
+        )
+        self.matrix = sparse.csc_array(
+            (data, self._indices, self._indptr), shape=(self._n, self._n)
+        )
+        diagonal = self.matrix.diagonal()
+        if not (diagonal > 0).all():
+            raise Unobservable("a state is in no measurement")
+        # Scaled to a unit diagonal, a pivot is the share of a state that the others leave open.
+        scale = 1.0 / np.sqrt(diagonal)
+        self._scale = scale
+        columns = np.repeat(np.arange(self._n), np.diff(self._indptr))
+        scaled = sparse.csc_array(
+            (data * scale[self._indices] * scale[columns], self._indices, self._indptr),
+            shape=(self._n, self._n),
+        )
+        try:
+            self.factor = sparse_linalg.splu(
+                scaled,
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise Unobservable("the gain is exactly singular") from error
+        if np.abs(self.factor.U.diagonal()).min() < 1e-13:
+            raise Unobservable("the gain is singular to working precision")
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        assert self.factor is not None
+        scale = self._scale if right.ndim == 1 else self._scale[:, None]
+        return np.asarray(scale * self.factor.solve(scale * right))
+
+    def inverse(self) -> FloatArray:
+        inverse = self.solve(np.eye(self._n))
+        return 0.5 * (inverse + inverse.T)
+
+
+class WeightedLeastSquares:
+    """Static state estimation for one sensor layout.
+
+    Parameters
+    ----------
+    network : Network
+    layout : SensorLayout
+    tolerance : float
+        Largest step of a converged state. [rad, p.u.]
+    max_iterations : int
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        layout: SensorLayout,
+        *,
+        tolerance: float = 1e-8,
+        max_iterations: int = 25,
+    ) -> None:
+        self.network = network
+        self.model = MeasurementModel(network, layout, state_columns(network, layout))
+        self.tolerance = tolerance
+        self.max_iterations = max_iterations
+        self._gain = _Gain(self.model)
+        # A current phasor has no tangent where the current vanishes, as it does at a flat start.
+        self._current = np.isin(layout.quantity, (IM, IA))
+
+    def flat_start(self) -> FloatArray:
+        """[θ; |V|] with no angle and rated voltage. (2N,)"""
+        n = self.network.n_bus
+        return np.concatenate([np.zeros(n), np.ones(n)])
+
+    def solve(
+        self,
+        z: FloatArray,
+        sigma: FloatArray,
+        available: BoolArray | None = None,
+        *,
+        start: FloatArray | None = None,
+    ) -> WlsSolution:
+        """Estimate the state.
+
+        Parameters
+        ----------
+        z, sigma : (m,) ndarray
+            Measurements and their σ; only available rows are read. [p.u., rad]
+        available : (m,) ndarray of bool, optional
+            Rows that carry a value; all of them by default.
+        start : (2N,) ndarray, optional
+            [θ; |V|] to start from; flat by default, and then current phasors join after the first
+            iterations only, when there is a current to compare them with.
+
+        Returns
+        -------
+        WlsSolution
+            ``converged`` is False if the iteration limit was reached or the state ran away.
+
+        Raises
+        ------
+        Unobservable
+            With the buses that the available measurements do not reach, and what would help.
+        """
+        m = self.model.shape[0]
+        rows = np.ones(m, dtype=bool) if available is None else np.asarray(available, dtype=bool)
+        weight = np.zeros(m)
+        weight[rows] = 1.0 / sigma[rows]
+        observed = np.where(rows, z, 0.0)
+        x = self.flat_start() if start is None else start.copy()
+        if start is None and (self._current & rows).any() and (~self._current & rows).any():
+            try:
+                x, _, _ = self._iterate(x, observed, np.where(self._current, 0.0, weight), 1e-2)
+            except Unobservable:
+                x = self.flat_start()
+        try:
+            x, iterations, converged = self._iterate(x, observed, weight, self.tolerance)
+        except Unobservable as error:
+            raise Unobservable(self._explain(x, weight, str(error))) from error
+        residual = self.model.residual(observed, x)
+        return WlsSolution(
+            x=x,
+            residual=np.where(rows, residual, np.nan),
+            objective=float(np.sum((weight * residual) ** 2)),
+            iterations=iterations,
+            converged=converged,
+            _gain=self._gain,
+            _columns=self.model.columns,
+        )
+
+    def _iterate(
+        self, x: FloatArray, z: FloatArray, weight: FloatArray, tolerance: float
+    ) -> tuple[FloatArray, int, bool]:
+        model = self.model
+        entry_weight = weight[model.row_of_entry]
+        for iteration in range(1, self.max_iterations + 1):
+            whitened = model.jacobian_data(x) * entry_weight
+            self._gain.factorise(whitened)
+            gradient = np.bincount(
+                model.indices,
+                weights=whitened * (weight * model.residual(z, x))[model.row_of_entry],
+                minlength=model.shape[1],
+            )
+            step = self._gain.solve(gradient)
+            x = x.copy()
+            x[model.columns] += step
+            largest = np.abs(step).max(initial=0.0)
+            if largest < tolerance:
+                return x, iteration, True
+            if not np.isfinite(largest) or (x[self.network.n_bus :] <= 0).any():
+                return x, iteration, False
+        return x, self.max_iterations, False
+
+    def _explain(self, x: FloatArray, weight: FloatArray, cause: str) -> str:
+        """Which buses the measurements leave open, from the null space of the whitened Jacobian."""
+        model, n = self.model, self.network.n_bus
+        dense = model.jacobian(x).toarray() * weight[:, None]
+        norm = np.linalg.norm(dense, axis=0)
+        _, singular, vectors = np.linalg.svd(
+            dense / np.where(norm > 0, norm, 1.0), full_matrices=True
+        )
+        rank = int((singular > 1e-10 * singular.max(initial=1e-300)).sum())
+        null = vectors[rank:]
+        touched = model.columns[np.flatnonzero(np.abs(null).max(axis=0, initial=0.0) > 1e-6)]
+        angle = [self.network.buses.name[c] for c in touched if c < n]
+        size = [self.network.buses.name[c - n] for c in touched if c >= n]
+        parts = [
+            f"{kind} of buses {', '.join(names[:8])}{', …' if len(names) > 8 else ''}"
+            for kind, names in (("the angles", angle), ("the magnitudes", size))
+            if names
+        ]
+        return (
+            f"{self.network.name} is not observable ({cause}): "
+            f"{int((weight > 0).sum())} measurements leave {model.shape[1] - rank} of "
+            f"{model.shape[1]} states open, among them {' and '.join(parts) or 'no single bus'}: "
+            "add a P and Q injection, a flow on a branch that ends there, or a voltage phasor"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _WlsState:
+    x: FloatArray
+    covariance: FloatArray
+
+
+def tracking_wls(name: str, network: Network, layout: SensorLayout) -> Estimator:
+    """Weighted least squares on every snapshot, started from the last estimate.
+
+    Parameters
+    ----------
+    name : str
+    network : Network
+    layout : SensorLayout
+
+    Returns
+    -------
+    Estimator
+        Held samples take part, with the σ that age gave them; the previous estimate is no prior.
+    """
+    wls = WeightedLeastSquares(network, layout)
+    model = wls.model
+
+    def solve(start: FloatArray | None, snapshot: Snapshot) -> tuple[_WlsState | None, Info]:
+        m = len(layout)
+        try:
+            solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available, start=start)
+            if not solution.converged and start is not None:
+                solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available)
+        except Unobservable as error:
+            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
+        if not solution.converged:
+            return None, Info.nothing(
+                m, Status.NOT_CONVERGED, f"no convergence in {solution.iterations} iterations"
+            )
+        covariance = solution.covariance()
+        J = model.jacobian(solution.x)
+        columns = np.ix_(model.columns, model.columns)
+        explained = np.asarray((J @ covariance[columns] * J.toarray()).sum(axis=1))
+        used = snapshot.available
+        left = np.maximum(snapshot.sigma**2 - explained, (1e-3 * snapshot.sigma) ** 2)
+        info = Info(
+            Status.OK,
+            solution.iterations,
+            solution.objective,
+            max(int(used.sum()) - model.shape[1], 0),
+            used,
+            solution.residual,
+            np.where(used, np.sqrt(left), np.nan),
+            np.zeros(m),
+        )
+        return _WlsState(solution.x, covariance), info
+
+    def init(snapshot: Snapshot) -> tuple[_WlsState | None, Info]:
+        return solve(None, snapshot)
+
+    def step(state: _WlsState, snapshot: Snapshot) -> tuple[_WlsState | None, Info]:
+        return solve(state.x, snapshot)
+
+    def read(state: _WlsState) -> Voltages:
+        return Voltages(state.x, state.covariance)
+
+    return Estimator(name, init, step, read)
