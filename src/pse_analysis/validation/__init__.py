@@ -1,0 +1,6 @@
+"""Validation of measurements: which samples of the telemetry can be trusted, and why not."""
+
+from pse_analysis.validation.rules import Rule, ValidateParams
+from pse_analysis.validation.stage import validate
+
+__all__ = ["Rule", "ValidateParams", "validate"]

@@ -1,0 +1,265 @@
+"""How much a channel's good samples change from one period to the next, learnt from its history.
+
+Everything later checks need follows from the structure function v(n) = variance of the increment
+over n sampling periods: σ² = v(1), the autocorrelation of increments
+ρ_n = [v(n+1) − 2v(n) + v(n−1)] / 2σ², and the spread over a gap
+v(m) = σ²(m + 2Σ_{i<m}(m−i)ρ_i).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from pse_analysis.validation.block import Criteria, screen
+from pse_analysis.validation.motion import SNAP, Motion
+from pse_analysis.vocabulary import Reason
+
+Array = npt.NDArray[np.float64]
+
+N_LAG = 8
+"""Lags of v(n) that are estimated; beyond, increments count as uncorrelated."""
+
+CLIP = 4.0
+"""History samples further than this many σ from the last good one are left out of σ."""
+
+FEWEST = 20
+"""Increments below which σ is not estimated."""
+
+_MAD_TO_SIGMA = 1.4826
+_ROUNDS = 12
+_SETTLED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Second moments of the good increments, per channel.
+
+    Attributes
+    ----------
+    variance : (n_channel, N_LAG + 1)
+        v(n), v(0) = 0; NaN where the history holds too few increments. [unit²]
+    count : (n_channel,) array of int
+        Good one-period increments that σ was estimated from.
+    repeats : (n_channel,)
+        Share of samples that equal their predecessor exactly, zeros not counted.
+    scale : (n_bin, n_channel) or None
+        σ at a time of day over the σ of all times.
+    """
+
+    variance: Array
+    count: npt.NDArray[np.int64]
+    repeats: Array
+    scale: Array | None = None
+
+    @property
+    def sigma(self) -> Array:
+        """σ of the good one-period increment, (n_channel,). [unit]"""
+        return np.asarray(np.sqrt(self.variance[:, 1]))
+
+    @property
+    def autocorrelation(self) -> Array:
+        """ρ_1 … ρ_{N_LAG−1} of the increments, (n_channel, N_LAG − 1)."""
+        return autocorrelation(self.variance)
+
+
+def autocorrelation(variance: npt.ArrayLike) -> Array:
+    """ρ_1 … ρ_{N−1} of increments from v(0 … N) along the last axis; 0 where v(1) = 0."""
+    v = np.asarray(variance, dtype=float)
+    second = v[..., 2:] - 2.0 * v[..., 1:-1] + v[..., :-2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(v[..., 1:2] > 0.0, second / (2.0 * v[..., 1:2]), 0.0))
+
+
+def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> Array:
+    """v(0 … n_lag) from σ and ρ_1, ρ_2, …: v(m) = σ²(m + 2Σ_{i<m}(m−i)ρ_i).
+
+    Parameters
+    ----------
+    sigma : (...,) array_like
+        Standard deviation of the one-period increment. [unit]
+    rho : (..., n) array_like
+        Its autocorrelation from lag 1; 0 beyond n.
+    n_lag : int
+
+    Returns
+    -------
+    (..., n_lag + 1) ndarray
+        [unit²]
+    """
+    r = np.atleast_1d(np.asarray(rho, dtype=float))
+    m = np.arange(n_lag + 1)[:, None]
+    i = np.arange(1, r.shape[-1] + 1)[None, :]
+    weight = np.maximum(m - i, 0)
+    s2 = np.square(np.asarray(sigma, dtype=float))[..., None]
+    return np.asarray(s2 * (np.arange(n_lag + 1) + 2.0 * (r @ weight.T)))
+
+
+def learn(
+    value: npt.ArrayLike,
+    time: npt.ArrayLike,
+    *,
+    bins: npt.NDArray[np.intp] | None = None,
+    n_bin: int = 0,
+    n_lag: int = N_LAG,
+    clip: float = CLIP,
+    robust: bool = True,
+) -> Structure:
+    """Structure function of the good increments in a history that holds gross errors.
+
+    Parameters
+    ----------
+    value : (n, n_channel) array_like
+        History; NaN where there is no sample or a sample is known to be bad. [unit]
+    time : (n, 1) or (n, n_channel) array_like
+        Time stamps in sampling periods.
+    bins : (n, 1) or (n, n_channel) array of int, optional
+        Time-of-day bin of each sample; with it, σ is also estimated per bin.
+    n_bin : int
+        Number of those bins.
+    n_lag : int
+        Largest lag.
+    clip : float
+        Samples further than this many σ from the last good one are left out.
+    robust : bool
+        False takes plain moments of every increment.
+
+    Returns
+    -------
+    Structure
+
+    Notes
+    -----
+    σ starts at the median absolute increment; then samples beyond ``clip`` σ of the last good one
+    (so a spike costs one sample, not two increments) leave the history and σ is their moment,
+    corrected for the truncation of a Gaussian, until it settles. Heavy-tailed loads keep the tails
+    that lie inside the clip; errors smaller than it stay in and raise σ a little.
+    """
+    x = np.asarray(value, dtype=float)
+    t = np.asarray(time, dtype=float)
+    n, n_channel = x.shape
+    kept = np.where(np.isfinite(x), x, np.nan)
+    repeats = _repeats(kept, t)
+    moments, count = _moments(kept, t, 1, np.full(n_channel, np.inf))
+    scale: Array | None = None
+    if robust and n:
+        sigma = _start(kept, t)
+        inside = 1.0 - 2.0 * clip * np.exp(-0.5 * clip**2) / np.sqrt(2.0 * np.pi) / (
+            2.0 * ndtr(clip) - 1.0
+        )
+        dirty = kept
+        for _ in range(_ROUNDS):
+            sample_scale = None if scale is None or bins is None else _spread(scale, bins)
+            kept = np.where(_outlying(dirty, t, sigma, clip, sample_scale), np.nan, dirty)
+            moments, count = _moments(kept, t, 1, clip * sigma, sample_scale)
+            new = np.where(count >= FEWEST, np.sqrt(moments / inside), np.nan)
+            if bins is not None:
+                scale = _by_bin(kept, t, bins, n_bin, new)
+            with np.errstate(invalid="ignore"):
+                still = np.abs(new - sigma) > _SETTLED * sigma
+            sigma = np.where(np.isnan(new), sigma, new)
+            if not still.any():
+                break
+        moments = np.where(count >= FEWEST, np.square(sigma), np.nan)
+    elif bins is not None:
+        scale = _by_bin(kept, t, bins, n_bin, np.sqrt(moments))
+    variance = np.zeros((n_channel, n_lag + 1))
+    variance[:, 1] = np.where(count >= FEWEST, moments, np.nan)
+    for lag in range(2, n_lag + 1):
+        # Two samples n apart differ by at most n·(clip·σ) unless a step lies between them.
+        bound = clip * lag * np.sqrt(variance[:, 1]) if robust else np.full(n_channel, np.inf)
+        moments, pairs = _moments(kept, t, lag, bound)
+        white = variance[:, lag - 1] + np.maximum(variance[:, lag - 1] - variance[:, lag - 2], 0.0)
+        variance[:, lag] = np.where(pairs >= FEWEST, moments, white)
+    return Structure(variance, count, repeats, scale)
+
+
+def _difference(x: Array, t: Array, lag: int) -> Array:
+    """x[lag:] − x[:−lag], NaN where that is not ``lag`` periods."""
+    if len(x) <= lag:
+        return np.full((0, x.shape[1]), np.nan)
+    with np.errstate(over="ignore", invalid="ignore"):
+        change = x[lag:] - x[:-lag]
+        even = np.abs(t[lag:] - t[:-lag] - lag) <= SNAP
+    return np.where(even & np.isfinite(change), change, np.nan)
+
+
+def _moments(
+    x: Array, t: Array, lag: int, bound: Array, scale: Array | None = None
+) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Mean square of the increments over ``lag`` periods inside the bound, and their number."""
+    change = _difference(x, t, lag)
+    if scale is not None:
+        change = change / scale[lag:]
+    with np.errstate(invalid="ignore", over="ignore"):
+        good = np.abs(change) <= bound
+        total = np.sum(np.square(change), axis=0, where=good)
+    count = good.sum(axis=0)
+    return total / np.maximum(count, 1), count.astype(np.int64)
+
+
+def _start(x: Array, t: Array) -> Array:
+    """First σ: from the median absolute increment, of those that are not 0 where half are."""
+    change = np.abs(_difference(x, t, 1))
+    change[~(change > 0.0)] = np.nan
+    sigma = np.zeros(x.shape[1])
+    some = np.flatnonzero(np.isfinite(change).any(axis=0))
+    if len(some):
+        sigma[some] = _MAD_TO_SIGMA * np.nanmedian(change[:, some], axis=0)
+    return sigma
+
+
+def _outlying(
+    x: Array, t: Array, sigma: Array, clip: float, scale: Array | None
+) -> npt.NDArray[np.bool_]:
+    n_channel = x.shape[1]
+    quantile = np.where(sigma > 0.0, clip, np.inf)
+    motion = Motion(
+        structure=np.square(np.nan_to_num(sigma))[:, None] * np.arange(3.0)[None, :],
+        k=np.zeros(n_channel),
+        increment=quantile,
+        extrapolation=np.full(n_channel, np.inf),
+        confirm=np.full(n_channel, 2),
+    )
+    criteria = Criteria(
+        lower=np.full(n_channel, np.nan),
+        upper=np.full(n_channel, np.nan),
+        motion=motion,
+        stuck=np.zeros(n_channel, dtype=np.int64),
+        stuck_at_zero=np.zeros(n_channel, dtype=bool),
+    )
+    found = screen(x, t, criteria, scale=scale, detail=False).reasons
+    return np.asarray((found & Reason.INCREMENT) != 0)
+
+
+def _repeats(x: Array, t: Array) -> Array:
+    change = _difference(x, t, 1)
+    real = np.isfinite(change) & (x[1:] != 0.0) if len(x) > 1 else np.isfinite(change)
+    same = real & (change == 0.0)
+    return np.asarray(same.sum(axis=0) / np.maximum(real.sum(axis=0), 1))
+
+
+def _spread(scale: Array, bins: npt.NDArray[np.intp]) -> Array:
+    """Scale of each sample, (n, n_channel), from (n_bin, n_channel)."""
+    if bins.shape[1] == 1:
+        return scale[bins[:, 0]]
+    return scale[bins, np.arange(scale.shape[1])[None, :]]
+
+
+def _by_bin(x: Array, t: Array, bins: npt.NDArray[np.intp], n_bin: int, sigma: Array) -> Array:
+    """σ per bin over σ; 1 where a bin holds too few increments."""
+    change = _difference(x, t, 1)
+    at = np.broadcast_to(bins[1:], change.shape) if len(bins) > 1 else bins[:0]
+    scale = np.ones((n_bin, x.shape[1]))
+    for which in range(n_bin):
+        good = (at == which) & np.isfinite(change)
+        count = good.sum(axis=0)
+        square = np.sum(np.square(change), axis=0, where=good) / np.maximum(count, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.sqrt(square) / sigma
+        usable = (count >= FEWEST) & np.isfinite(ratio) & (ratio > 0.0)
+        scale[which, usable] = ratio[usable]
+    return scale

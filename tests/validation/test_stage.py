@@ -1,0 +1,199 @@
+"""The stage keeps every sample, says what is wrong with each, and never looks ahead."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pse_analysis import vocabulary
+from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.validation import Rule, ValidateParams, validate
+from pse_analysis.vocabulary import Flag, Reason
+
+START = pd.Timestamp("2016-06-06", tz="UTC")
+HISTORY_END = datetime(2016, 6, 7, tzinfo=UTC)
+NAME = "scada:bus/1:p_mw"
+
+
+def channels(**changes: object) -> pd.DataFrame:
+    row = {
+        "channel": NAME, "source": "scada", "quantity": "p_mw", "element": "bus/1", "side": "",
+        "unit": "mw", "sigma": 0.01, "sigma_kind": "absolute", "lower": -100.0, "upper": 100.0,
+        "period_s": 300.0, "sign": np.int8(1), "aggregation": "instant",
+    }  # fmt: skip
+    return pd.DataFrame([row | changes])
+
+
+def telemetry(value: np.ndarray, seconds: np.ndarray | None = None, **more: object) -> pd.DataFrame:
+    n = len(value)
+    offset = np.arange(n) * 300.0 if seconds is None else seconds
+    time = pd.Series(START + pd.to_timedelta(offset, unit="s")).dt.as_unit("us")
+    frame = pd.DataFrame(
+        {
+            "trial": np.zeros(n, dtype=np.int32),
+            "channel": NAME,
+            "seq": np.arange(n),
+            "time_utc": time,
+            "arrival_utc": (time + pd.Timedelta("2s")).dt.as_unit("us"),
+            "value": np.asarray(value, dtype=float),
+            "quality": pd.array([pd.NA] * n, dtype="Int16"),
+        }
+    )
+    return frame.assign(**more)
+
+
+def walk(n: int, seed: int = 11) -> np.ndarray:
+    return 20.0 + np.cumsum(np.random.default_rng(seed).normal(0.0, 0.1, n))
+
+
+GIVEN = ValidateParams((Rule(increment=1.0),))
+
+
+def reasons(frame: pd.DataFrame, params: ValidateParams = GIVEN) -> list[int]:
+    return validate(frame, channels(), params)["reasons"].tolist()
+
+
+def test_a_spike_costs_one_sample_and_its_value_is_kept() -> None:
+    value = walk(50)
+    value[20] += 30.0
+    out = validate(telemetry(value), channels(), GIVEN)
+    assert np.flatnonzero(out["flag"] == Flag.BAD).tolist() == [20]
+    assert out["reasons"].iloc[20] == Reason.INCREMENT
+    assert out["value"].iloc[20] == value[20]
+    assert np.isnan(out["corrected"].iloc[20])
+    assert out["statistic"].iloc[20] == pytest.approx(value[20] - value[19])
+    assert out["threshold"].iloc[20] == pytest.approx(1.0)
+    np.testing.assert_array_equal(out["corrected"].drop(20), np.delete(value, 20))
+
+
+def test_a_step_is_accepted_after_the_confirming_samples() -> None:
+    for confirm in (1, 2, 4):
+        value = walk(40)
+        value[20:] += 30.0
+        found = reasons(telemetry(value), ValidateParams((Rule(increment=1.0, confirm=confirm),)))
+        assert found[20 : 20 + confirm] == [Reason.INCREMENT] * confirm
+        assert found[20 + confirm] == Reason.STEP_ACCEPTED
+        assert not any(found[21 + confirm :])
+
+
+def test_sample_faults_get_their_reason() -> None:
+    value = walk(40)
+    value[5], value[6], value[7] = np.nan, np.inf, 5000.0
+    seconds = np.arange(40) * 300.0
+    seconds[12] = seconds[11]
+    seconds[15] = seconds[13] + 50.0
+    seconds[30:] += 900.0
+    frame = telemetry(value, seconds)
+    frame.loc[25, "arrival_utc"] = frame.loc[25, "time_utc"] + pd.Timedelta("1h")
+    frame["quality"] = pd.array([0] * 34 + [7] * 6, dtype="Int16")
+    params = ValidateParams((Rule(increment=1.0, bad_quality=(7, 9)),))
+    found = reasons(frame, params)
+    expected = {
+        5: Reason.NOT_FINITE,
+        6: Reason.NOT_FINITE,
+        7: Reason.LIMIT,
+        12: Reason.DUPLICATE,
+        13: Reason.GAP,
+        15: Reason.BACKWARD,
+        16: Reason.GAP,
+        25: Reason.LATE,
+        30: Reason.GAP,
+        **dict.fromkeys(range(34, 40), Reason.QUALITY),
+    }
+    assert {i: r for i, r in enumerate(found) if r} == expected
+
+
+def test_no_row_is_lost_and_the_rows_keep_their_order_and_index() -> None:
+    frame = pd.concat([telemetry(walk(30)), telemetry(walk(30, 12)).assign(trial=np.int32(1))])
+    shuffled = frame.sample(frac=1.0, random_state=5)
+    shuffled.index = pd.RangeIndex(100, 160)
+    out = validate(shuffled, channels(), GIVEN)
+    assert out.index.equals(shuffled.index)
+    pd.testing.assert_frame_equal(
+        out[list(vocabulary.KEYS["telemetry"])], shuffled[list(vocabulary.KEYS["telemetry"])]
+    )
+    straight = validate(frame.reset_index(drop=True), channels(), GIVEN)
+    key = list(vocabulary.KEYS["telemetry"])
+    pd.testing.assert_frame_equal(
+        out.sort_values(key, ignore_index=True), straight.sort_values(key, ignore_index=True)
+    )
+
+
+def test_changing_the_future_changes_no_flag_of_the_past() -> None:
+    rng = np.random.default_rng(3)
+    value = walk(900)
+    hit = rng.random(900) < 0.05
+    value[hit] += rng.uniform(-2.0, 2.0, hit.sum())
+    frame = telemetry(value)
+    base = validate(frame, channels(), history_end=HISTORY_END)
+    cut = 500
+    future = frame.copy()
+    future.loc[cut:, "value"] = rng.permutation(value[cut:])
+    changed = validate(future, channels(), history_end=HISTORY_END)
+    columns = ["flag", "reasons", "statistic", "threshold", "corrected"]
+    pd.testing.assert_frame_equal(base.loc[: cut - 1, columns], changed.loc[: cut - 1, columns])
+    assert base["flag"].iloc[288:cut].gt(0).any()
+    assert not base.loc[cut:, "reasons"].equals(changed.loc[cut:, "reasons"])
+
+
+def test_thresholds_are_learnt_from_the_history() -> None:
+    value = walk(900)
+    out = validate(telemetry(value), channels(), history_end=HISTORY_END)
+    gamma = out["threshold"].iloc[300:]
+    spread = np.std(np.diff(value[:288]))
+    assert gamma.median() == pytest.approx(3.512 * spread, rel=0.05)
+    unlearnt = validate(telemetry(value), channels())
+    assert unlearnt["threshold"].isna().all()
+
+
+def test_later_rules_override_field_by_field() -> None:
+    value = walk(40)
+    value[10] += 5.0
+    rules = (
+        Rule(increment=1.0, upper=50.0),
+        Rule(source="scada", increment=8.0),
+        Rule(channel="*bus/1:*", unit="kw", upper=18_000.0),
+    )
+    found = np.array(reasons(telemetry(value), ValidateParams(rules)))
+    np.testing.assert_array_equal((found & Reason.LIMIT) != 0, value > 18.0)
+    assert not (found & Reason.INCREMENT).any()
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"source": "pmu"}, "matches no channel"),
+        ({"unit": "kv", "lower": 1.0}, "does not convert to 'mw'"),
+        ({"lower": 200.0}, "swap them"),
+    ],
+)
+def test_rules_that_cannot_hold_say_so(rule: dict[str, object], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        validate(telemetry(walk(5)), channels(), ValidateParams((Rule(**rule),)))
+
+
+def test_a_prior_that_rejects_everything_is_reported() -> None:
+    rules = ValidateParams((Rule(q=0.5, cost_miss=5.0),))
+    with pytest.raises(ParameterError, match="rejecting every sample is the cheapest"):
+        validate(telemetry(walk(400)), channels(), rules, history_end=HISTORY_END)
+
+
+def test_a_sample_of_an_unknown_channel_is_refused() -> None:
+    frame = telemetry(walk(5)).assign(channel="scada:bus/2:p_mw")
+    with pytest.raises(TableError, match="'scada:bus/2:p_mw' is not in the table of channels"):
+        validate(frame, channels(), GIVEN)
+
+
+def test_naive_history_end_is_refused() -> None:
+    with pytest.raises(ParameterError, match="no time zone"):
+        validate(telemetry(walk(5)), channels(), history_end=datetime(2016, 6, 7))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_tiny_tables_pass_through(n: int) -> None:
+    out = validate(telemetry(walk(n)), channels(), history_end=HISTORY_END)
+    assert len(out) == n
+    assert not out["flag"].any()
