@@ -18,7 +18,7 @@ from pse_analysis.errors import ParameterError, PseError, TableError
 from pse_analysis.pipeline import runner
 from pse_analysis.pipeline.cache import Store
 from pse_analysis.pipeline.case import Case, list_cases, load_case, project_root
-from pse_analysis.pipeline.plan import NAMES, Options, Reporter, Result
+from pse_analysis.pipeline.plan import NAMES, THREADS, Options, Reporter, Result
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -203,7 +203,7 @@ def _explain(error: Exception, debug: bool) -> int:
 def _run(options: argparse.Namespace) -> int:
     # The matrices are small: threads inside BLAS cost more than they bring, and results must not
     # depend on how many there are. It has no effect once numpy is imported, so it stands here.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    for name in THREADS:
         os.environ.setdefault(name, "1")
     wanted = Options(
         until=options.until,

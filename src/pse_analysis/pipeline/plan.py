@@ -17,6 +17,9 @@ from pse_analysis.pipeline.case import Case, project_root
 
 SUMMARY = "summary.txt"
 
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""What the BLAS libraries read, when numpy is imported, to learn how many threads to start."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -46,7 +49,7 @@ STAGES = (
     Stage(
         "validate",
         "pse_analysis.validation",
-        keys=("validate",),
+        keys=("study", "validate"),
         raw=("telemetry", "channels.parquet", "sample_truth.parquet", "faults.parquet"),
     ),
     Stage(
