@@ -18,7 +18,7 @@ from pse_analysis.measurement import SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.vocabulary import check
 
-__all__ = ["Estimated", "EstimateParams", "Estimator", "Method", "Record", "build", "estimate"]
+__all__ = ["EstimateParams", "Estimated", "Estimator", "Method", "Record", "build", "estimate"]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def build(
     )
     # Samples that average an interval arrive with a delay; a multiple of the step is kept for it.
     averaged = history.fresh & (layout.window_s > 0)
-    delay = float(history.age_s[averaged].max()) if averaged.any() else 0.0
+    delay = float(np.quantile(history.age_s[averaged], 0.95)) if averaged.any() else 0.0
     return kalman_filter(
         method.name,
         network,

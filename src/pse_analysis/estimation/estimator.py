@@ -187,7 +187,7 @@ def record(aligned: pd.DataFrame, layout: SensorLayout) -> Record:
     shape = (len(times), len(layout))
 
     def scattered(values: npt.ArrayLike, start: float, kind: type = float) -> npt.NDArray[Any]:
-        out = np.full(shape, start, dtype=kind)
+        out: npt.NDArray[Any] = np.full(shape, start, dtype=kind)
         out[row, column] = values
         return out
 
@@ -204,7 +204,8 @@ def record(aligned: pd.DataFrame, layout: SensorLayout) -> Record:
 
 
 def _utc(times: pd.Series) -> npt.NDArray[np.datetime64]:
-    return times.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy().astype("datetime64[us]")
+    naive = times.dt.tz_convert("UTC").dt.tz_localize(None)
+    return np.asarray(naive.to_numpy().astype("datetime64[us]"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +307,7 @@ def _consistent(nis: FloatArray, dof: npt.NDArray[np.int64]) -> BoolArray:
         ratio = total / freedom
         wide = (ratio >= CONSISTENCY_RATIO[0]) & (ratio <= CONSISTENCY_RATIO[1])
     judged = np.isfinite(total) & (freedom > 0)
-    return ~judged | wide | ((total >= low) & (total <= high))
+    return np.asarray(~judged | wide | ((total >= low) & (total <= high)))
 
 
 def _tables(

@@ -1,10 +1,10 @@
 """Kalman filter on the linear rectangular model, with the recent past in its state.
 
-A sample is rarely taken at the instant it is used at: a meter reports the mean of the last quarter of
-an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last K instants
-beside the present one, and reads a sample through the weights with which its interval covers them,
-by linear interpolation between instants. What interpolation leaves out, the movement inside a step,
-is added to the sample's variance. So a sample enters once, where it belongs.
+A sample is rarely taken at the instant it is used at: a meter reports the mean of the last quarter
+of an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last K
+instants beside the present one, and reads a sample through the weights with which its interval
+covers them, by linear interpolation between instants. What interpolation leaves out, the movement
+inside a step, is added to the sample's variance. So a sample enters once, where it belongs.
 """
 
 from __future__ import annotations
@@ -45,17 +45,13 @@ class KalmanState:
     """
 
     x: FloatArray
-    P: FloatArray  # noqa: N815 (the field's letter)
+    P: FloatArray
 
 
 def predict(state: KalmanState, noise: FloatArray) -> KalmanState:
     """One step of the random walk: the present gets Q, every older state moves back by one."""
     n = noise.shape[0]
-    source = (
-        np.concatenate([np.arange(n), np.arange(len(state.x) - n)])
-        if len(state.x) > n
-        else np.arange(n)
-    )
+    source = np.concatenate([np.arange(n), np.arange(len(state.x) - n)])
     x = state.x[source]
     covariance = state.P[np.ix_(source, source)]
     covariance[:n, :n] += noise
@@ -107,7 +103,7 @@ def update(
 def interval_weights(
     age_s: FloatArray, window_s: FloatArray, step_s: float, lags: int
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """How samples that end ``age_s`` ago and average ``window_s`` read the states of the last steps.
+    """How samples that end ``age_s`` ago and average ``window_s`` read the last states.
 
     Parameters
     ----------
@@ -187,7 +183,8 @@ def kalman_filter(
 
     Notes
     -----
-    Eqs. (25)–(29) of [qi2025] with constant H where all samples are instantaneous and of full age 0.
+    Eqs. (25)–(29) of [qi2025] with constant H where all samples are instantaneous and of
+    age 0.
     """
     model = RectangularModel(network, layout)
     wls = WeightedLeastSquares(network, layout)
@@ -246,7 +243,7 @@ def kalman_filter(
         rows = np.flatnonzero(used)
         sigma = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
         at = before
-        for passes in range(1, MAX_PASSES + 1):
+        for passes in range(1, MAX_PASSES + 1):  # noqa: B007 (reported after the loop)
             H, z, spread = model.rows(snapshot.z, sigma, used, at)
             H, z, spread = H[rows].toarray(), z[rows], spread[rows]
             moved = np.einsum("ij,ij->i", H @ walk, H)

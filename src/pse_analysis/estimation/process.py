@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -80,8 +81,8 @@ class Sensitivity:
 
     Notes
     -----
-    With the rows of the power flow split by its unknowns u and held voltages v, J_u du + J_v dv = dS,
-    so S = J_u⁻¹ and s = -J_u⁻¹ J_v.
+    With the rows of the power flow split by its unknowns u and held voltages v,
+    J_u du + J_v dv = dS, so S = J_u⁻¹ and s = -J_u⁻¹ J_v.
     """
 
     def __init__(self, network: Network) -> None:
@@ -145,7 +146,7 @@ def load_noise(network: Network, statistics: LoadStatistics) -> ProcessNoise:
     time, which changes them by less than 1 %.
     """
     sensitivity = Sensitivity(network)
-    kept: dict[str, npt.NDArray[np.generic]] = {}
+    kept: dict[str, Any] = {}
 
     def noise(voltage: ComplexArray, time: np.datetime64) -> FloatArray:
         if "at" not in kept or np.abs(kept["at"] - voltage).max() > 1e-3:
@@ -202,9 +203,10 @@ def learn_load(
 
     Notes
     -----
-    Increments of a random walk with variance rate r, sampled every T as means over W, have variance
-    r (T - W/3); twice the meter's own variance is taken off first. The correlation is shrunk towards
-    the identity by the intensity that Schäfer and Strimmer (2005) derive from its sampling variance.
+    Increments of a random walk with variance rate r, sampled every T as means over W, have
+    variance r (T - W/3); twice the meter's own variance is taken off first. The correlation is
+    shrunk towards the identity by the intensity that Schäfer and Strimmer (2005) derive from its
+    sampling variance.
     """
     n = network.n_bus
     slots = round(DAY_S / slot_s)
@@ -250,7 +252,7 @@ def _second_of_day(time: npt.NDArray[np.datetime64]) -> FloatArray:
 def _by_slot(
     square: FloatArray, of_day: FloatArray, slots: int, slot_s: float, bandwidth_s: float
 ) -> FloatArray:
-    """Mean square by slot of the day, smoothed around the clock and shrunk towards the day's mean."""
+    """Mean square by slot of the day, smoothed around the clock, shrunk to the day's mean."""
     centre = (np.arange(slots) + 0.5) * slot_s
     apart = np.abs(centre[:, None] - of_day[None, :])
     apart = np.minimum(apart, DAY_S - apart)
@@ -262,7 +264,7 @@ def _by_slot(
 
 
 def _shrunk_correlation(panel: FloatArray) -> FloatArray:
-    """Correlation of the columns of (n_time, k) values with gaps, shrunk to be positive definite."""
+    """Correlation of the columns of (n_time, k) values, shrunk to be positive definite."""
     full = panel[np.isfinite(panel).all(axis=1)]
     k = panel.shape[1]
     if len(full) < 8:
@@ -296,9 +298,9 @@ def learn_source(
 ) -> float:
     """Learn σ of the source voltage's change per step as a local level under measurement noise.
 
-    Every voltage reading, less the part that the metered injections explain (by the sensitivities at
-    the nominal state), reads the source; their mean follows a random walk plus noise, whose variance
-    ratio is found by maximum likelihood.
+    Every voltage reading, less the part that the metered injections explain (by the sensitivities
+    at the nominal state), reads the source; their mean follows a random walk plus noise, whose
+    variance ratio is found by maximum likelihood.
 
     Returns
     -------

@@ -200,7 +200,7 @@ class WeightedLeastSquares:
         weight = np.zeros(m)
         weight[rows] = 1.0 / sigma[rows]
         observed = np.where(rows, z, 0.0)
-        x = self.flat_start() if start is None else start.copy()
+        x: FloatArray = self.flat_start() if start is None else start.copy()
         if start is None and (self._current & rows).any() and (~self._current & rows).any():
             try:
                 x, _, _ = self._iterate(x, observed, np.where(self._current, 0.0, weight), 1e-2)
@@ -229,7 +229,7 @@ class WeightedLeastSquares:
         for iteration in range(1, self.max_iterations + 1):
             whitened = model.jacobian_data(x) * entry_weight
             self._gain.factorise(whitened)
-            gradient = np.bincount(
+            gradient: FloatArray = np.bincount(
                 model.indices,
                 weights=whitened * (weight * model.residual(z, x))[model.row_of_entry],
                 minlength=model.shape[1],

@@ -1,0 +1,110 @@
+"""Whether a filter is as sure as it should be: NIS, NEES and the coverage of ±2σ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from pse_analysis.scoring.errors import METRICS
+from pse_analysis.vocabulary import Status
+
+NOMINAL_COVERAGE = float(stats.norm.cdf(2.0) - stats.norm.cdf(-2.0))
+"""Share of a normal variable inside ±2σ, 0.954."""
+
+
+def bounds(dof: float, confidence: float = 0.99) -> tuple[float, float]:
+    """Bounds of NIS/dof (or NEES/dof) for a filter's own model.
+
+    Parameters
+    ----------
+    dof : float
+        Degrees of freedom summed over steps (NIS) or trials (NEES).
+    confidence : float
+        Probability inside the two-sided bounds.
+
+    Returns
+    -------
+    low, high : float
+    """
+    tail = 0.5 * (1.0 - confidence)
+    low, high = stats.chi2.ppf([tail, 1.0 - tail], dof) / dof
+    return float(low), float(high)
+
+
+def of_steps(steps: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
+    """Consistency and cost of every method and trial.
+
+    Parameters
+    ----------
+    steps : DataFrame
+        Table ``steps``.
+    by_hour : bool
+        Whether to add NIS by hour of day.
+
+    Returns
+    -------
+    DataFrame
+        Metrics ``nis_ratio`` (ΣNIS/Σm), ``nees`` (mean over steps), ``steps_not_ok`` and
+        ``seconds``.
+    """
+    judged = steps["nis"].notna() & (steps["dof"] > 0)
+    table = steps.assign(
+        nis=steps["nis"].where(judged),
+        dof=steps["dof"].where(judged),
+        not_ok=(steps["status"] != Status.OK).astype(float),
+        element="hour/" + steps["time_utc"].dt.strftime("%H"),
+    )
+    key = ["method", "trial"]
+    whole = table.groupby(key, sort=True)
+    rows = [
+        _long(whole["nis"].sum(min_count=1) / whole["dof"].sum(min_count=1), "nis_ratio", "1"),
+        _long(whole["nees"].mean(), "nees", "1"),
+        _long(whole["not_ok"].sum(), "steps_not_ok", "1"),
+        _long(whole["seconds"].sum(), "seconds", "s"),
+    ]
+    if by_hour:
+        hourly = table.groupby([*key, "element"], sort=True)
+        rows.append(
+            _long(hourly["nis"].sum(min_count=1) / hourly["dof"].sum(min_count=1), "nis_ratio", "1")
+        )
+    return pd.concat(rows, ignore_index=True)
+
+
+def coverage(paired: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
+    """Share of the truth inside ±2σ of the estimate; 0.954 where σ is right.
+
+    Parameters
+    ----------
+    paired : DataFrame
+        From `pse_analysis.scoring.errors.against_truth`.
+    by_hour : bool
+        Whether to add rows by hour of day.
+
+    Returns
+    -------
+    DataFrame
+        Metrics ``coverage_vm`` and ``coverage_va``. Exact zeros of σ (a reference angle that is
+        fixed) do not count.
+    """
+    rows = []
+    free = paired[paired["sigma"] > 0]
+    table = free.assign(
+        inside=(free["error"].abs() <= 2.0 * free["sigma"]).astype(float),
+        element="hour/" + free["time_utc"].dt.strftime("%H"),
+    )
+    for quantity, (name, _, _) in METRICS.items():
+        part = table[table["quantity"] == quantity]
+        keys = [["method", "trial"]] + ([["method", "trial", "element"]] if by_hour else [])
+        rows.extend(
+            _long(part.groupby(key, sort=True)["inside"].mean(), f"coverage_{name}", "1")
+            for key in keys
+        )
+    return pd.concat(rows, ignore_index=True)
+
+
+def _long(values: pd.Series, metric: str, unit: str) -> pd.DataFrame:
+    table = values.rename("value").astype(np.float64).reset_index()
+    if "element" not in table:
+        table["element"] = ""
+    return table.assign(metric=metric, unit=unit)
