@@ -79,6 +79,7 @@ def study_tables(n_instant: int = 288, n_trial: int = 2) -> StudyTables:
             "channel": keep.channel,
             "value_pu": keep.value,
             "sigma_pu": 0.004,
+            "sigma_age_pu": 0.001,
             "origin": np.where(keep.seq % 3 == 0, "measured", "held"),
             "sample_utc": keep.time_utc,
             "time_confidence": 1.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pse_analysis.recording.estimates import estimated, scored
 from pse_analysis.recording.telemetry import aligned, validated
 
-__all__ = ["aligned", "validated"]
+__all__ = ["aligned", "estimated", "scored", "validated"]

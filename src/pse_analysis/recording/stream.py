@@ -29,6 +29,8 @@ BOUND = "#8C8C8C"
 # The graph view takes positions as screen points and draws text at a fixed size: this is the
 # distance between neighbours at which a bus name fits inside its node.
 _HOP = 46.0
+_DISC = 13.0
+_ABOVE = 26.0
 
 
 @contextmanager
@@ -239,12 +241,14 @@ def grid(
     names = list(network.buses.name)
     live = network.branches.in_service
     pairs = zip(network.branches.from_bus[live], network.branches.to_bus[live], strict=True)
+    # A node with text shows its colour in the letters only, so the names are nodes of their own.
     stream.log(
         entity,
-        rr.GraphNodes(node_ids=names, positions=at, labels=names, show_labels=True),
+        rr.GraphNodes(node_ids=names, positions=at, radii=[_DISC] * len(names), show_labels=False),
         rr.GraphEdges(edges=[(names[i], names[j]) for i, j in pairs], graph_type="undirected"),
         static=True,
     )
+    _words(stream, f"{entity}/names", at - [0.0, _ABOVE], names)
     rgb = sequential(values.to_numpy(dtype=np.float64), largest)
     stream.send_columns(
         entity,
@@ -252,20 +256,55 @@ def grid(
         columns=rr.GraphNodes.columns(colors=_packed(rgb)).partition([len(names)] * len(values)),
     )
     ticks = np.linspace(0.0, largest, 6)
-    texts = [f"{tick * scale:g}" for tick in ticks]
-    texts[-1] = f"≥ {texts[-1]} {unit}"
-    x = np.linspace(0.0, 5 * 1.7 * _HOP, 6)
+    foot = np.stack(
+        [np.linspace(0.0, 5 * 1.7 * _HOP, 6), np.full(6, at[:, 1].max() + 1.8 * _HOP)], axis=1
+    )
     stream.log(
         f"{entity}/scale",
         rr.GraphNodes(
             node_ids=[f"scale {i}" for i in range(6)],
-            positions=np.stack([x, np.full(6, at[:, 1].max() + 1.8 * _HOP)], axis=1),
-            labels=texts,
+            positions=foot,
             colors=_packed(sequential(ticks, largest)),
-            show_labels=True,
+            radii=[_DISC] * 6,
+            show_labels=False,
         ),
         static=True,
     )
+    texts = [f"{tick * scale:g}" for tick in ticks]
+    texts[-1] += f" {unit}"
+    _words(stream, f"{entity}/scale/names", foot + [0.0, _ABOVE], texts)
+
+
+def grid_view(origin: str, name: str, network: Network) -> rrb.GraphView:
+    """A view that holds the whole of what `grid` draws."""
+    xy = layout(network)
+    wide, high = (xy.max(axis=0) - xy.min(axis=0)) * _HOP
+    wide = max(wide, 5 * 1.7 * _HOP + 40.0)
+    bounds = rrb.VisualBounds2D(x_range=(-60.0, wide + 60.0), y_range=(-high - 70.0, 140.0))
+    return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
+
+
+def _words(
+    stream: rr.RecordingStream,
+    entity: str,
+    at: npt.NDArray[np.float64],
+    texts: Sequence[str],
+) -> None:
+    nodes = rr.GraphNodes(
+        node_ids=[f"{entity} {i}" for i in range(len(texts))],
+        positions=at,
+        labels=texts,
+        colors=[_rgb("#9A9A9A")] * len(texts),
+        show_labels=True,
+    )
+    stream.log(entity, nodes, static=True)
+
+
+def bars(stream: rr.RecordingStream, entity: str, values: npt.ArrayLike, colour: str) -> None:
+    """One row of bars, numbered from 1."""
+    height = np.nan_to_num(np.asarray(values, dtype=np.float64))
+    chart = rr.BarChart(height, abscissa=np.arange(1, len(height) + 1), color=_rgb(colour))
+    stream.log(entity, chart, static=True)
 
 
 def page(stream: rr.RecordingStream, entity: str, markdown: str) -> None:
@@ -283,7 +322,7 @@ class Window:
 
     def axis(self) -> rrb.TimeAxis:
         """Time axis with a small margin, without which the labels at both ends are cut off."""
-        margin = 0.03 * (self.end - self.start)
+        margin = 0.04 * (self.end - self.start)
         bounds = [
             rr.TimeRangeBoundary.absolute(nanos=moment.as_unit("ns").value)
             for moment in (self.start - margin, self.end + margin)
@@ -355,7 +394,7 @@ def panels(*parts: rrb.BlueprintPart) -> rrb.Blueprint:
         *parts,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
     )
 
 
