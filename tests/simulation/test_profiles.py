@@ -155,11 +155,13 @@ def test_a_study_outside_the_curves_names_their_reach():
     start = pd.Timestamp("2016-06-11", tz="UTC")
     with pytest.raises(ParameterError, match="reach from 2016-06-05T22:00:00"):
         profiles.between(frame, start, start + pd.Timedelta(days=3))
-    part = profiles.between(frame, start + pd.Timedelta(minutes=5), start + pd.Timedelta(minutes=20))
+    part = profiles.between(
+        frame, start + pd.Timedelta(minutes=5), start + pd.Timedelta(minutes=20)
+    )
     assert part.index[0] == start
     assert part.index[-1] == start + pd.Timedelta(minutes=30)
 
 
 def test_an_unknown_class_lists_the_known_ones():
-    with pytest.raises(ParameterError, match="no curve 'H9_pload'.*H0-A"):
+    with pytest.raises(ParameterError, match=r"no curve 'H9_pload'.*H0-A"):
         profiles.column(profiles.load(FOLDER), "H9_pload", "simulate.load")

@@ -47,13 +47,16 @@ def main() -> None:
         raise SystemExit("simbench is not installed: pip install simbench==1.6.3")
     source = Path(spec.origin).parent / "networks" / "1-complete_data-mixed-all-0-sw"
     here = Path(__file__).parent
-    loads = week(source / "LoadProfile.csv", [f"{c}_{k}" for c in LOADS for k in ("pload", "qload")])
+    loads = week(
+        source / "LoadProfile.csv", [f"{c}_{k}" for c in LOADS for k in ("pload", "qload")]
+    )
     pv = week(source / "RESProfile.csv", list(PV))
     frame = pd.concat([loads, pv], axis=1)
     table = pa.table(
         {
-            "time_utc": pa.array(frame.index.to_numpy(), pa.timestamp("us"))
-            .cast(pa.timestamp("us", tz="UTC")),
+            "time_utc": pa.array(frame.index.to_numpy(), pa.timestamp("us")).cast(
+                pa.timestamp("us", tz="UTC")
+            ),
             **{c: pa.array(frame[c].to_numpy(), pa.float32()) for c in frame.columns},
         }
     )

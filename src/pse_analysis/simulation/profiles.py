@@ -16,7 +16,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 from pse_analysis.errors import ParameterError, TableError
 
@@ -72,7 +71,7 @@ def load(folder: str | Path) -> pd.DataFrame:
             f"load profiles: time_utc of {path} has no time zone; expected timestamp[us, tz=UTC]"
         )
     frame.index = index.tz_convert("UTC").as_unit("us")
-    step = np.diff(frame.index.to_numpy()) / np.timedelta64(1, "s")
+    step = np.diff(frame.index.asi8) / 1e6
     if len(frame) < 2 or np.any(step != PROFILE_STEP_S):
         raise TableError(
             f"load profiles: {path} must rise in steps of {PROFILE_STEP_S:g} s, received "
@@ -120,6 +119,19 @@ def column(profiles: pd.DataFrame, name: str, where: str) -> FloatArray:
             f"{', '.join(names)}"
         )
     return np.asarray(profiles[name].to_numpy(), dtype=np.float64)
+
+
+def ar1(drive: FloatArray, phi: float) -> FloatArray:
+    """Solution of y_k = φ y_{k−1} + drive_k along the last axis, from y_{−1} = 0.
+
+    Sums over twice as many terms in each pass, so a record takes about log₂ n passes.
+    """
+    y = np.array(drive, dtype=np.float64)
+    reach = 1
+    while reach < y.shape[-1] and abs(phi) ** reach > 1e-18:
+        y[..., reach:] += phi**reach * y[..., :-reach]
+        reach *= 2
+    return y
 
 
 def local_volatility(points: FloatArray, window: int = 8) -> FloatArray:
@@ -241,7 +253,7 @@ def _conditioned(unit: FloatArray, normal: FloatArray, phi: float) -> FloatArray
     sigma2 = step_variance(k, phi)
     drive = normal * np.sqrt(1.0 - phi**2)
     drive[:, 0] = normal[:, 0]
-    free = lfilter([np.sqrt(sigma2)], [1.0, -phi], drive, axis=1).reshape(n, n_interval, k)
+    free = (np.sqrt(sigma2) * ar1(drive, phi)).reshape(n, n_interval, k)
 
     geometric = float(np.sum(phi ** np.arange(k)))
     decay = phi**k
@@ -252,8 +264,7 @@ def _conditioned(unit: FloatArray, normal: FloatArray, phi: float) -> FloatArray
 
     def tail(w: FloatArray) -> FloatArray:
         """Sum over earlier intervals, decaying by φᵏ for each interval in between."""
-        shifted = np.pad(w[:, :-1], ((0, 0), (1, 0)))
-        return np.asarray(lfilter([1.0], [1.0, -decay], shifted, axis=1))
+        return ar1(np.pad(w[:, :-1], ((0, 0), (1, 0))), decay)
 
     before = tail(weight)
     after = tail(weight[:, ::-1])[:, ::-1]

@@ -1,0 +1,246 @@
+"""What a case file may say about its simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Literal
+
+from pse_analysis.errors import ParameterError
+from pse_analysis.vocabulary import FaultKind, Quantity, Source
+
+
+def _require(condition: bool, where: str, expected: str, received: object) -> None:
+    if not condition:
+        raise ParameterError(f"[{where}] expected {expected}, received {received!r}")
+
+
+@dataclass(frozen=True)
+class LoadParams:
+    """How loads are made of curves.
+
+    Attributes
+    ----------
+    classes
+        Curves to draw from, e.g. ``lv_rural1``: ``<class>_pload`` and ``<class>_qload``.
+    per_bus
+        Classes mixed at a bus, drawn without replacement.
+    concentration
+        Of the Dirichlet law of their weights; large: equal shares.
+    level
+        Mean load over the week, relative to the nominal load. [1]
+    rho1
+        Lag-1 autocorrelation of the load's increments per truth step.
+    window
+        Quarter hours over which the volatility of the bridge is averaged.
+    """
+
+    classes: tuple[str, ...] = (
+        *("lv_rural1", "lv_rural2", "lv_semiurb4", "lv_semiurb5", "lv_urban6"),
+        *("H0-H", "G3-H", "G4-H", "BL-H", "WB-H", "G0-M", "G3-M", "G4-M", "L2-M"),
+    )
+    per_bus: int = 3
+    concentration: float = 2.0
+    level: float = 0.6
+    rho1: float = 0.0
+    window: int = 8
+
+    def __post_init__(self) -> None:
+        where = "simulate.load"
+        n = len(self.classes)
+        _require(1 <= self.per_bus <= n, where, f"per_bus in 1 … {n}", self.per_bus)
+        _require(self.concentration > 0, where, "concentration > 0", self.concentration)
+        _require(self.level > 0, where, "level > 0", self.level)
+        _require(-1 < self.rho1 < 1, where, "-1 < rho1 < 1", self.rho1)
+        _require(self.window >= 1, where, "window ≥ 1", self.window)
+
+
+@dataclass(frozen=True)
+class SourceVoltageParams:
+    """How the slack bus's voltage moves about its set-point.
+
+    Attributes
+    ----------
+    sigma_pu, time_constant_s
+        Standard deviation and time constant of a stationary AR(1) process. [p.u., s]
+    tap_pu, taps_per_day, max_taps
+        Size and mean number of tap changes, and how far they may lead from the set-point.
+    """
+
+    sigma_pu: float = 0.002
+    time_constant_s: float = 1800.0
+    tap_pu: float = 0.00625
+    taps_per_day: float = 6.0
+    max_taps: int = 2
+
+    def __post_init__(self) -> None:
+        where = "simulate.source_voltage"
+        _require(self.sigma_pu >= 0, where, "sigma_pu ≥ 0", self.sigma_pu)
+        _require(self.time_constant_s > 0, where, "time_constant_s > 0", self.time_constant_s)
+        _require(self.taps_per_day >= 0, where, "taps_per_day ≥ 0", self.taps_per_day)
+        _require(self.max_taps >= 0, where, "max_taps ≥ 0", self.max_taps)
+
+
+@dataclass(frozen=True)
+class PvParams:
+    """A PV plant at unity power factor: bus name, rated power [MW] and its curve."""
+
+    bus: str
+    peak_mw: float
+    profile: str = "PV1"
+
+
+@dataclass(frozen=True)
+class SensorParams:
+    """A group of like sensors.
+
+    Attributes
+    ----------
+    source
+        ``scada``, ``pmu`` or ``ami``.
+    quantities
+        What each of them measures.
+    at
+        Elements (``bus/6``, ``branch/7-8``) or groups: ``buses``, ``loads`` (buses with a nominal
+        load), ``injections`` (with load or generation), ``branches`` (in service).
+    sigma, sigma_kind
+        Standard deviation, in the channel's unit or as a fraction of the magnitude
+        (`pse_analysis.measurement.standard_deviation` states the floor).
+    period_s, phase_s
+        Samples stand at history start + phase + j·period; a mean first after a full period. [s]
+    side
+        Metered end of branches.
+    aggregation
+        ``instant``, or ``mean`` over the truth instants in (stamp − period, stamp].
+    delay_s, jitter_s
+        A sample arrives delay + U(0, jitter) after its sampling time; all quantities that one
+        element measures arrive together. [s]
+    stamp
+        ``sampling``: the time stamp is the sampling time. ``arrival``: the source has no clock, and
+        the master station stamps what arrives.
+    sign
+        −1 for a source that counts consumption, or flow out of the branch, as positive.
+    limits
+        Credible range by quantity, in the channel's unit.
+    limit_factor
+        Credible range of powers and currents without one in ``limits``: this multiple of the
+        apparent power or current at nominal load; 0 for none.
+    """
+
+    source: str
+    quantities: tuple[str, ...]
+    at: tuple[str, ...]
+    sigma: float
+    period_s: float
+    sigma_kind: Literal["absolute", "relative"] = "absolute"
+    phase_s: float = 0.0
+    side: Literal["from", "to"] = "from"
+    aggregation: Literal["instant", "mean"] = "instant"
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    stamp: Literal["sampling", "arrival"] = "sampling"
+    sign: Literal[1, -1] = 1
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    limit_factor: float = 0.0
+
+    def __post_init__(self) -> None:
+        where = "simulate.sensors"
+        sources = [str(s) for s in Source if s is not Source.PSEUDO]
+        _require(self.source in sources, where, f"source in {', '.join(sources)}", self.source)
+        known = [str(q) for q in Quantity]
+        for name in (*self.quantities, *self.limits):
+            _require(name in known, where, f"quantities in {', '.join(known)}", name)
+        _require(bool(self.quantities) and bool(self.at), where, "quantities and at", self.at)
+        _require(self.sigma > 0, where, "sigma > 0", self.sigma)
+        _require(self.period_s > 0, where, "period_s > 0", self.period_s)
+        for name in ("phase_s", "delay_s", "jitter_s", "limit_factor"):
+            _require(getattr(self, name) >= 0, where, f"{name} ≥ 0", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class FaultParams:
+    """One kind of fault of telemetry; a sample has at most one fault, the first in the list.
+
+    Attributes
+    ----------
+    kind
+        ``spike``, ``stale``, ``lost``, ``duplicated`` or ``delayed``.
+    rate
+        Share of the samples concerned (for ``stale``: of samples inside episodes), on average.
+    size
+        Range from which the size is drawn uniformly; its meaning follows the kind:
+        spike: multiples of the channel's σ, or of the true magnitude if ``relative``, of random
+        sign; stale: length of an episode [s]; duplicated: how much later the copy arrives [s];
+        delayed: how much later than usual the sample arrives [s]; lost: unused.
+    relative
+        Whether the size of spikes is relative to the true magnitude.
+    source, quantities, at
+        Only these channels; empty for all. ``at`` lists elements.
+    start, end
+        Only samples taken in [start, end).
+    """
+
+    kind: str
+    rate: float
+    size: tuple[float, float] = (0.0, 0.0)
+    relative: bool = False
+    source: str = ""
+    quantities: tuple[str, ...] = ()
+    at: tuple[str, ...] = ()
+    start: datetime | None = None
+    end: datetime | None = None
+
+    def __post_init__(self) -> None:
+        where = "simulate.faults"
+        kinds = [str(k) for k in FaultKind]
+        _require(self.kind in kinds, where, f"kind in {', '.join(kinds)}", self.kind)
+        _require(0 <= self.rate <= 1, where, "rate in 0 … 1", self.rate)
+        low, high = self.size
+        needs_size = self.kind != FaultKind.LOST
+        _require(
+            (0 < low <= high) if needs_size else True,
+            where,
+            f"size = [low, high] with 0 < low ≤ high for {self.kind!r}",
+            self.size,
+        )
+        for name in ("start", "end"):
+            time = getattr(self, name)
+            _require(time is None or time.tzinfo is not None, where, f"{name} with 'Z'", time)
+
+
+@dataclass(frozen=True)
+class SimulateParams:
+    """Everything that a simulated case is made of; one seed gives the same bytes again.
+
+    Attributes
+    ----------
+    seed
+        Of all randomness. The mix of load classes belongs to the case and is shared by its trials;
+        bridges, source voltage, noise and faults belong to a trial. A trial does not depend on how
+        many there are, nor a sensor group's noise on the groups after it.
+    trials
+        Number of realisations.
+    truth_step_s
+        Step of the truth; divides 900 s and the study's step. [s]
+    """
+
+    seed: int
+    sensors: tuple[SensorParams, ...]
+    trials: int = 1
+    truth_step_s: float = 60.0
+    load: LoadParams = field(default_factory=LoadParams)
+    source_voltage: SourceVoltageParams = field(default_factory=SourceVoltageParams)
+    pv: tuple[PvParams, ...] = ()
+    faults: tuple[FaultParams, ...] = ()
+
+    def __post_init__(self) -> None:
+        _require(self.seed >= 0, "simulate", "seed ≥ 0", self.seed)
+        _require(self.trials >= 1, "simulate", "trials ≥ 1", self.trials)
+        _require(
+            self.truth_step_s > 0 and (900.0 / self.truth_step_s).is_integer(),
+            "simulate",
+            "truth_step_s that divides 900",
+            self.truth_step_s,
+        )
+        _require(bool(self.sensors), "simulate", "at least one [[simulate.sensors]]", self.sensors)

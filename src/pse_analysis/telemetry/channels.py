@@ -1,0 +1,155 @@
+"""Whether channels fit the grid, and whether injections are free of shunts."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from pse_analysis.errors import TableError
+from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.vocabulary import UNITS, Quantity, check
+
+FloatArray = npt.NDArray[np.float64]
+
+_VOLTAGES = (Quantity.VM_PU, Quantity.VA_DEGREE)
+
+
+def check_channels(channels: pd.DataFrame, network: Network) -> pd.DataFrame:
+    """The channels table, with its columns, elements, sides and units checked.
+
+    Raises
+    ------
+    TableError
+        On the first channel that does not fit, with what was expected.
+    """
+    if "sigma" in channels.columns and "channel" in channels.columns:
+        sigma = pd.to_numeric(channels["sigma"], errors="coerce")
+        bad = ~(sigma > 0).to_numpy()
+        if bad.any():
+            row = channels.loc[bad].iloc[0]
+            raise TableError(
+                f"channels: sigma of {row['channel']!r} must be a standard deviation above 0, "
+                f"received {row['sigma']!r}; take it from the sensor's accuracy class"
+            )
+    checked = check("channels", channels)
+    names = {"bus": network.buses.name, "branch": network.branches.name}
+    known = {kind: set(of) for kind, of in names.items()}
+    for channel, quantity, element, side, unit in zip(
+        *(checked[c] for c in ("channel", "quantity", "element", "side", "unit")), strict=True
+    ):
+        kind, _, name = element.partition("/")
+        if name not in known[kind]:
+            raise TableError(
+                f"channels: {channel!r} stands at {element!r}, but {network.name} has no {kind} "
+                f"{name!r}: {suggest(name, names[kind])}"
+            )
+        if (side == "") != (kind == "bus"):
+            raise TableError(
+                f"channels: side of {channel!r} at {element!r}: expected "
+                f"{repr('') if kind == 'bus' else 'from or to'}, received {side!r}"
+            )
+        if kind == "branch" and quantity in _VOLTAGES:
+            raise TableError(
+                f"channels: {channel!r} measures {quantity} at {element!r}: a voltage belongs to "
+                "a bus; name the bus at that end"
+            )
+        units = UNITS[Quantity(quantity)]
+        if unit not in units:
+            raise TableError(
+                f"channels: unit of {channel!r} does not fit {quantity}: expected "
+                f"{' or '.join(map(repr, units))}, received {unit!r}; convert the values, or mend "
+                "the unit"
+            )
+    return checked
+
+
+def suggest(name: str, names: Iterable[str]) -> str:
+    """What to write instead of an unknown name."""
+    names = [str(n) for n in names]
+    close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    if close:
+        return f"did you mean {' or '.join(map(repr, close))}?"
+    return f"expected one of {', '.join(names[:6])}{', …' if len(names) > 6 else ''}"
+
+
+def check_known(telemetry: pd.DataFrame, channels: pd.DataFrame) -> None:
+    """Refuse telemetry of a channel that the channels table does not describe.
+
+    Raises
+    ------
+    TableError
+        With the channel and a close match.
+    """
+    received = pd.unique(telemetry["channel"])
+    known = set(channels["channel"])
+    unknown = [c for c in received if c not in known]
+    if unknown:
+        raise TableError(
+            f"telemetry: channel {unknown[0]!r} is not in the channels table "
+            f"({len(unknown)} such): {suggest(str(unknown[0]), known)} Add it to the channels, or "
+            "leave its rows out"
+        )
+
+
+def check_shunts(telemetry: pd.DataFrame, channels: pd.DataFrame, network: Network) -> None:
+    """Refuse injections that look as if they contained the bus's own shunt.
+
+    Other tools report a bus result as load plus shunt; here the shunt belongs to the grid model,
+    and copying such results is a silent error. The check compares medians at buses without
+    generation that have a shunt, an injection channel and a voltage channel: it refuses when the
+    injection lies within a tenth of the shunt's power of *some share (0 … 1.5) of the nominal load
+    plus the shunt*, and further than half of the shunt's power from any such share without it.
+
+    Parameters
+    ----------
+    telemetry, channels
+        In this project's units and signs (``sign`` = 1, first unit of each quantity).
+    network
+        The grid.
+
+    Raises
+    ------
+    TableError
+        With the bus, the median, and the shunt's power.
+    """
+    buses = network.buses
+    shunted = (buses.b_shunt_pu != 0) | (buses.g_shunt_pu != 0)
+    quiet = shunted & (buses.kind == BusKind.PQ) & (buses.p_gen_mw == 0)
+    if not quiet.any():
+        return
+    at = channels[channels["element"].isin([f"bus/{buses.name[i]}" for i in np.flatnonzero(quiet)])]
+    wanted = at[at["quantity"].isin([Quantity.VM_PU, Quantity.P_MW, Quantity.Q_MVAR])]
+    if wanted.empty:
+        return
+    part = telemetry[telemetry["channel"].isin(wanted["channel"])]
+    median = part["value"].where(np.isfinite(part["value"])).groupby(part["channel"]).median()
+    for element, group in wanted.groupby("element"):
+        i = network.bus(str(element).partition("/")[2])
+        by_quantity = {
+            q: median.reindex(c["channel"]).dropna().to_numpy()
+            for q, c in group.groupby("quantity")
+        }
+        voltage = by_quantity.get(Quantity.VM_PU)
+        if voltage is None or not len(voltage):
+            continue
+        square = float(np.median(voltage)) ** 2 * network.base_mva
+        for quantity, nominal, shunt, unit in (
+            (Quantity.P_MW, -buses.p_load_mw[i], -buses.g_shunt_pu[i] * square, "MW"),
+            (Quantity.Q_MVAR, -buses.q_load_mvar[i], buses.b_shunt_pu[i] * square, "Mvar"),
+        ):
+            for value in by_quantity.get(quantity, ()):
+                low, high = sorted((0.0, 1.5 * float(nominal)))
+                plain = abs(value - np.clip(value, low, high))
+                with_shunt = abs(value - shunt - np.clip(value - shunt, low, high))
+                if with_shunt < 0.1 * abs(shunt) and plain > 0.5 * abs(shunt):
+                    raise TableError(
+                        f"telemetry: {quantity} at {element} has a median of {value:.4g} {unit}, "
+                        f"which looks like the load (nominal {nominal:.4g}) plus the bus's own "
+                        f"shunt ({shunt:.4g} {unit}): shunts belong to the grid model. Subtract it "
+                        "from the values; or, if the injection really is that, pass "
+                        "shunts='accept'"
+                    )

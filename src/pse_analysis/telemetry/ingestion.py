@@ -1,0 +1,216 @@
+"""The door for tables of one's own: names, units, signs and times are translated here only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from pse_analysis.errors import TableError
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import SensorLayout
+from pse_analysis.telemetry.channels import check_channels, check_known, check_shunts
+from pse_analysis.telemetry.tables import RawCase
+from pse_analysis.vocabulary import UNITS, Quantity, check
+
+_UNIT_NAMES = {
+    "p.u.": "pu",
+    "p.u": "pu",
+    "deg": "degree",
+    "degrees": "degree",
+    "°": "degree",
+    "radian": "rad",
+    "radians": "rad",
+}
+_CHANNEL_DEFAULTS: Mapping[str, object] = {
+    "side": "",
+    "lower": np.nan,
+    "upper": np.nan,
+    "sign": 1,
+    "aggregation": "instant",
+}
+
+
+def ingest(
+    frame: pd.DataFrame,
+    channels: pd.DataFrame,
+    network: Network,
+    *,
+    timezone: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    tags: Mapping[str, str] | None = None,
+    shunts: Literal["refuse", "accept"] = "refuse",
+) -> RawCase:
+    """Turn tables of one's own into a raw case.
+
+    Nothing is dropped or repaired: NaN, infinities, duplicates and backward stamps stay, for
+    `validate` to flag.
+
+    Parameters
+    ----------
+    frame
+        One row per sample: ``channel``, ``time_utc``, ``value``; where known ``arrival_utc``,
+        ``quality`` (the source's own code) and ``trial``.
+    channels
+        Table ``channels``; ``side``, ``lower``, ``upper``, ``sign`` and ``aggregation`` may be
+        absent. ``unit``, ``sigma``, limits and ``sign`` describe the values as they are in
+        ``frame``; sign −1 says that the source counts consumption, or flow out of the branch, as
+        positive.
+    network
+        The grid.
+    timezone
+        Zone of times that carry none, e.g. ``Europe/Berlin``; without it such times are refused.
+    columns
+        Own column name → the name above.
+    tags
+        Own channel name → channel.
+    shunts
+        What to do when an injection looks as if it contained the bus's shunt
+        (`pse_analysis.telemetry.check_shunts`).
+
+    Returns
+    -------
+    RawCase
+        Telemetry and channels in this project's convention: every value in the first unit of its
+        quantity, every sign 1, times in UTC and microseconds, ``seq`` by order of arrival (of
+        rows, where no arrival is known).
+
+    Raises
+    ------
+    TableError
+        With what was expected, what came and what to do.
+    """
+    given = _channels(channels, network)
+    frame = frame.rename(columns=dict(columns or {}))
+    for name in ("channel", "time_utc", "value"):
+        if name not in frame.columns:
+            raise TableError(
+                f"telemetry: column {name!r} is missing; expected channel, time_utc and value; "
+                f"received {', '.join(map(str, frame.columns))}; say columns={{'YOURS': {name!r}}}"
+            )
+    if frame.empty:
+        raise TableError("telemetry: no rows; expected at least one sample: check the export")
+    channel = frame["channel"].astype(object)
+    if tags is not None:
+        channel = channel.map(lambda tag: tags.get(tag, tag))
+    channel = channel.astype(str)
+    check_known(pd.DataFrame({"channel": channel}), given)
+
+    value = frame["value"]
+    if not pd.api.types.is_numeric_dtype(value.dtype) or pd.api.types.is_bool_dtype(value.dtype):
+        raise TableError(
+            f"telemetry: column 'value' must be numeric, received {value.dtype}, e.g. "
+            f"{value.iloc[0]!r}; use pandas.to_numeric(frame.value, errors='coerce'): what is no "
+            "number becomes NaN and is flagged as missing"
+        )
+    standard = given.assign(
+        unit=[UNITS[Quantity(q)][0] for q in given["quantity"]],
+        sign=np.ones(len(given), dtype=np.int8),
+    )
+    ratio = (
+        SensorLayout.from_channels(given, network).scale
+        / SensorLayout.from_channels(standard, network).scale
+    )
+    row = pd.Index(given["channel"]).get_indexer(pd.Index(channel))
+    time = _utc(frame["time_utc"], "time_utc", timezone)
+    if time.isna().any():
+        raise TableError(
+            f"telemetry: time_utc is empty in {int(time.isna().sum())} rows, first row "
+            f"{int(np.flatnonzero(time.isna())[0])}; a sample without a time cannot be placed: "
+            "use its arrival, or leave it out"
+        )
+    known = "arrival_utc" in frame.columns
+    arrival = (
+        _utc(frame["arrival_utc"], "arrival_utc", timezone)
+        if known
+        else pd.Series(pd.NaT, index=time.index, dtype=time.dtype)
+    )
+    telemetry = pd.DataFrame(
+        {
+            "trial": _integers(frame, "trial", 0).astype(np.int32),
+            "channel": channel.to_numpy(dtype=object),
+            "time_utc": time.array,
+            "arrival_utc": arrival.array,
+            "value": value.to_numpy(dtype=np.float64, na_value=np.nan) * ratio[row],
+            "quality": pd.array(_integers(frame, "quality", None), dtype="Int16"),
+        }
+    )
+    order = arrival.fillna(time).argsort(kind="stable").to_numpy() if known else None
+    telemetry = telemetry if order is None else telemetry.take(order)
+    telemetry["seq"] = telemetry.groupby(["trial", "channel"]).cumcount().astype(np.int64)
+    translated = _translated(standard, ratio)
+    if shunts == "refuse":
+        check_shunts(telemetry, translated, network)
+    telemetry = telemetry.sort_values(["trial", "channel", "seq"], ignore_index=True)
+    return RawCase(network, translated, check("telemetry", telemetry))
+
+
+def _channels(channels: pd.DataFrame, network: Network) -> pd.DataFrame:
+    """The channels as given, with defaults, plain spellings of units and the schema's types."""
+    filled = channels.assign(
+        **{n: v for n, v in _CHANNEL_DEFAULTS.items() if n not in channels.columns}
+    )
+    if "unit" in filled.columns:
+        unit = filled["unit"].astype(str).str.strip().str.lower()
+        filled["unit"] = unit.map(lambda u: _UNIT_NAMES.get(u, u)).astype(object)
+    for name in ("sigma", "lower", "upper", "period_s"):
+        if name in filled.columns and pd.api.types.is_numeric_dtype(filled[name].dtype):
+            filled[name] = filled[name].astype(np.float64)
+    if "sign" in filled.columns and pd.api.types.is_numeric_dtype(filled["sign"].dtype):
+        filled["sign"] = filled["sign"].astype(np.int8)
+    return check_channels(filled.reset_index(drop=True), network)
+
+
+def _translated(
+    standard: pd.DataFrame, ratio: np.ndarray[tuple[int], np.dtype[np.float64]]
+) -> pd.DataFrame:
+    """Channels in standard units and signs, with σ and limits converted."""
+    lower, upper = (standard[n].to_numpy(dtype=float) * ratio for n in ("lower", "upper"))
+    turned = ratio < 0
+    absolute = (standard["sigma_kind"] == "absolute").to_numpy()
+    return standard.assign(
+        sigma=standard["sigma"].to_numpy(dtype=float) * np.where(absolute, np.abs(ratio), 1.0),
+        lower=np.where(turned, upper, lower),
+        upper=np.where(turned, lower, upper),
+    )
+
+
+def _utc(times: pd.Series, name: str, timezone: str | None) -> pd.Series:
+    """Times in UTC and microseconds."""
+    if not pd.api.types.is_datetime64_any_dtype(times.dtype):
+        raise TableError(
+            f"telemetry: column {name!r} must hold times, received {times.dtype}, e.g. "
+            f"{times.iloc[0]!r}; use pandas.to_datetime(frame.{name}, utc=True), or without utc "
+            "and with timezone= here if they are local times"
+        )
+    times = times.reset_index(drop=True)
+    if times.dt.tz is None:
+        if timezone is None:
+            raise TableError(
+                f"telemetry: column {name!r} has no time zone (first: {times.iloc[0]}); expected "
+                "UTC or any other zone: pass timezone='UTC' or e.g. timezone='Europe/Berlin'"
+            )
+        try:
+            times = times.dt.tz_localize(timezone)
+        except Exception as error:
+            raise TableError(
+                f"telemetry: column {name!r} cannot be read as times in {timezone!r} ({error}); "
+                "around a change of summer time only the source's UTC offset tells: export UTC"
+            ) from error
+    return times.dt.tz_convert("UTC").dt.as_unit("us")
+
+
+def _integers(
+    frame: pd.DataFrame, name: str, default: int | None
+) -> pd.api.extensions.ExtensionArray:
+    if name not in frame.columns:
+        return pd.array([default] * len(frame), dtype="Int64")
+    try:
+        return frame[name].astype("Int64").array
+    except (TypeError, ValueError) as error:
+        raise TableError(
+            f"telemetry: column {name!r} must hold whole numbers, received "
+            f"{frame[name].dtype}, e.g. {frame[name].iloc[0]!r}: map the source's codes to numbers"
+        ) from error
