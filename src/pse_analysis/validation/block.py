@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.validation.motion import CHUNK_SAMPLES, Motion, Walk
+from pse_analysis.validation.motion import Motion
+from pse_analysis.validation.walk import CHUNK_SAMPLES, Chunk, Walk
 from pse_analysis.vocabulary import SEVERITY, Flag, Reason
 
 Array = npt.NDArray[np.float64]
@@ -119,11 +120,12 @@ def screen(
     for start in range(0, n, step):
         rows = slice(start, min(start + step, n))
         part, bits = x[rows], found[rows]
-        work = part.copy()
+        work = walk.samples(len(part))
+        np.copyto(work, part)
         if reasons is not None:
             work[(bits & RULED_OUT) != 0] = np.nan
-        outside = ~((part >= lower) & (part <= upper))
-        at = np.nonzero(outside)
+        inside = (part >= lower) & (part <= upper)
+        at = np.nonzero(~inside)
         if len(at[0]):
             bits[at] |= np.where(np.isfinite(part[at]), Reason.LIMIT, Reason.NOT_FINITE).astype(
                 np.int32
@@ -133,13 +135,15 @@ def screen(
         bits[stuck_at] |= np.int32(Reason.STUCK)
         work[stuck_at] = np.nan
         walk.step(
-            work,
-            t[rows],
-            None if scale is None else scale[rows],
-            bits,
-            None if statistic is None else statistic[rows],
-            None if threshold is None else threshold[rows],
-            None if backward is None else backward[rows],
+            Chunk(
+                value=work,
+                time=t[rows],
+                reasons=bits,
+                statistic=None if statistic is None else statistic[rows],
+                threshold=None if threshold is None else threshold[rows],
+                scale=None if scale is None else scale[rows],
+                backward=None if backward is None else backward[rows],
+            )
         )
         if statistic is not None and threshold is not None:
             statistic[rows][stuck_at] = run_there
