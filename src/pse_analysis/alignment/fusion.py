@@ -91,7 +91,7 @@ def align(
             f"validated: channel {name!r} is not in the channels table: add it there, or drop it"
         )
     instants = _instants(study)
-    samples = _usable_in_order(validated, column)
+    samples = _usable_in_order(validated, column, layout)
     rate = _movement(samples, layout, study) if params.growth == "history" else None
     limit = np.array(
         [params.max_age_s.get(s, params.default_max_age_s) for s in channels["source"]]
@@ -162,9 +162,11 @@ def _microseconds(times: pd.Series) -> IntArray:
     return np.asarray(naive.to_numpy().astype("datetime64[us]").astype(np.int64))
 
 
-def _usable_in_order(validated: pd.DataFrame, column: IntArray) -> _Samples:
-    """Usable samples that are not older than one which arrived before them."""
-    value = validated["corrected"].to_numpy(dtype=float)
+def _usable_in_order(
+    validated: pd.DataFrame, column: IntArray, layout: SensorLayout
+) -> _Samples:
+    """Usable samples, in per unit, that are not older than one which arrived before them."""
+    value = validated["corrected"].to_numpy(dtype=float) * layout.scale[column]
     keep = usable(validated["flag"].to_numpy()) & np.isfinite(value)
     rows = validated[keep]
     trial = rows["trial"].to_numpy(dtype=np.int64)

@@ -36,6 +36,8 @@ ProcessNoise = Callable[[ComplexArray, np.datetime64], FloatArray]
 """Covariance of x = [e; f] added by the step to an instant, (2N, 2N), at a forecast voltage."""
 
 DAY_S = 86400.0
+USUAL_SOURCE = 1e-3
+"""σ of the source voltage's change per step where history tells nothing. [p.u.]"""
 
 
 def scalar_noise(network: Network, variance: float) -> ProcessNoise:
@@ -241,7 +243,7 @@ def learn_load(
         correlation[index] = _shrunk_correlation(np.array(standard).T)
     _fill_unmetered(deviation, network)
     if source is None:
-        source = learn_source(history, layout, network, deviation)
+        source = learn_source(history, layout, network)
     return LoadStatistics(deviation, correlation, source, slot_s)
 
 
@@ -293,49 +295,68 @@ def _fill_unmetered(deviation: FloatArray, network: Network) -> None:
     deviation[:, rest] = relative[:, None] * nominal[rest]
 
 
-def learn_source(
-    history: Record, layout: SensorLayout, network: Network, deviation: FloatArray
-) -> float:
-    """Learn σ of the source voltage's change per step as a local level under measurement noise.
+def learn_source(history: Record, layout: SensorLayout, network: Network) -> float:
+    """Learn σ of the source voltage's change per step as a local level under white noise.
 
     Every voltage reading, less the part that the metered injections explain (by the sensitivities
-    at the nominal state), reads the source; their mean follows a random walk plus noise, whose
-    variance ratio is found by maximum likelihood.
+    at the nominal state), reads the source; their mean follows a random walk plus noise. The ratio
+    of the two variances maximises the likelihood, in which the scale is concentrated out: what the
+    meters between two samples do not tell is then counted as noise, not as movement of the source.
+
+    Parameters
+    ----------
+    history : Record
+    layout : SensorLayout
+    network : Network
 
     Returns
     -------
     float
-        1e-3 p.u. if there are fewer than 24 instants with a voltage reading. [p.u.]
+        `USUAL_SOURCE` if there are fewer than 24 instants with a voltage reading. [p.u.]
     """
-    n = network.n_bus
     rows = np.flatnonzero(layout.quantity == VM)
-    injections = np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS))
     fresh = history.fresh[:, rows]
-    if not len(rows) or (fresh.any(axis=1)).sum() < 24:
-        return 1e-3
-    by_input, _ = Sensitivity(network).at(solve(network).x)
-    explained = np.zeros((len(history.time), n))
-    for row in injections:
-        place = layout.position[row] + (n if layout.quantity[row] == Q else 0)
-        seen = history.available[:, row]
-        level = history.z[seen, row].mean() if seen.any() else 0.0
-        value = np.where(seen, history.z[:, row], level)
-        explained += np.outer(value, by_input[n:, place])
+    if fresh.any(axis=1).sum() < 24:
+        return USUAL_SOURCE
+    explained = _explained_voltage(history, layout, network)
     reading = history.z[:, rows] - explained[:, layout.position[rows]]
     reading = reading - np.nanmean(np.where(fresh, reading, np.nan), axis=0)
     count = fresh.sum(axis=1)
     level = np.where(fresh, reading, 0.0).sum(axis=1)[count > 0] / count[count > 0]
-    meter = float(np.mean(layout.sigma[rows] ** 2) / np.mean(count[count > 0]))
 
-    def cost(log_ratio: float) -> float:
-        # Steady-state Kalman filter of a local level: innovations by one recursive filter.
+    def innovation(log_ratio: float) -> tuple[FloatArray, float]:
+        """Innovations of the steady-state filter, and their variance in units of the noise's."""
         ratio = np.exp(log_ratio)
         prior = 0.5 * (ratio + np.sqrt(ratio**2 + 4.0 * ratio))
         gain = prior / (prior + 1.0)
         forecast = signal.lfilter([gain], [1.0, gain - 1.0], level, zi=[(1 - gain) * level[0]])[0]
-        innovation = level[1:] - forecast[:-1]
-        variance = meter * (prior + 1.0)
-        return float(np.sum(innovation**2) / variance + len(innovation) * np.log(variance))
+        return level[1:] - forecast[:-1], float(prior + 1.0)
+
+    def cost(log_ratio: float) -> float:
+        # With the scale s² = mean(η²)/v, n log s² + n log v leaves n log mean(η²).
+        return float(np.log(np.mean(innovation(log_ratio)[0] ** 2)))
 
     found = optimize.minimize_scalar(cost, bounds=(-12.0, 4.0), method="bounded")
-    return float(np.sqrt(meter * np.exp(found.x)))
+    eta, variance = innovation(float(found.x))
+    return float(np.sqrt(np.exp(found.x) * np.mean(eta**2) / variance))
+
+
+def _explained_voltage(history: Record, layout: SensorLayout, network: Network) -> FloatArray:
+    """Part of |V| that the metered injections explain at every instant. (T, N) [p.u.]
+
+    All of this is history, so a mean counts at the middle of its interval and the time between two
+    samples is interpolated.
+    """
+    n = network.n_bus
+    by_input, _ = Sensitivity(network).at(solve(network).x)
+    explained = np.zeros((len(history.time), n))
+    second = (history.time - history.time[0]) / np.timedelta64(1, "s")
+    for row in np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS)):
+        use = history.fresh[:, row]
+        if not use.any():
+            continue
+        middle = second[use] - history.age_s[use, row] - 0.5 * layout.window_s[row]
+        value = np.interp(second, middle, history.z[use, row])
+        place = layout.position[row] + (n if layout.quantity[row] == Q else 0)
+        explained += np.outer(value, by_input[n:, place])
+    return explained
