@@ -72,6 +72,7 @@ def inject(
             copies = Samples(
                 **{f.name: getattr(samples, f.name)[hit] for f in dataclasses.fields(Samples)}
             )
+            samples = dataclasses.replace(samples, taken=samples.taken | hit)
             copies = _mark(copies, np.ones(int(hit.sum()), dtype=bool), fault, size[hit])
             copies = dataclasses.replace(copies, arrival=copies.arrival + _us(size[hit]))
             samples = Samples(
@@ -97,7 +98,7 @@ def _eligible(
         allowed &= channels["quantity"].isin(fault.quantities).to_numpy()
     if fault.at:
         allowed &= channels["element"].isin(fault.at).to_numpy()
-    eligible: npt.NDArray[np.bool_] = allowed[samples.channel] & (samples.kind == 0)
+    eligible: npt.NDArray[np.bool_] = allowed[samples.channel] & ~samples.taken
     if fault.start is not None:
         eligible &= samples.sampled >= microseconds(fault.start)
     if fault.end is not None:
@@ -115,6 +116,7 @@ def _mark(
         samples,
         kind=np.where(hit, np.int8(code(fault.kind)), samples.kind),
         size=np.where(hit, size, samples.size),
+        taken=samples.taken | hit,
     )
 
 
@@ -142,4 +144,10 @@ def _stale(
     )
     age = (samples.sampled - samples.sampled[last]) / SECOND
     samples = _mark(samples, inside, fault, age)
-    return dataclasses.replace(samples, value=np.where(inside, samples.value[last], samples.value))
+    repeated = np.zeros(n, dtype=bool)
+    repeated[last[inside]] = True
+    return dataclasses.replace(
+        samples,
+        value=np.where(inside, samples.value[last], samples.value),
+        taken=samples.taken | repeated,
+    )

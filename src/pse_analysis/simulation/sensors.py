@@ -45,6 +45,9 @@ class Samples:
         0, or 1 + position of the fault's kind in `FaultKind`.
     size : (n,) ndarray
         Size of the fault; 0 without one.
+    taken : (n,) ndarray of bool
+        Whether a fault refers to the sample, so that no other may touch it: faulty ones, but also
+        the first copy of a duplicated one and the value that a stale channel repeats.
     """
 
     channel: IntArray
@@ -55,6 +58,7 @@ class Samples:
     sigma: FloatArray
     kind: npt.NDArray[np.int8]
     size: FloatArray
+    taken: npt.NDArray[np.bool_]
 
 
 def elements(network: Network, at: tuple[str, ...], where: str = "simulate.sensors") -> list[str]:
@@ -230,6 +234,7 @@ def observe(
         sigma=np.abs(layout.from_per_unit(sigma)).ravel(),
         kind=np.zeros(n * m, dtype=np.int8),
         size=np.zeros(n * m),
+        taken=np.zeros(n * m, dtype=bool),
     )
 
 
