@@ -221,7 +221,7 @@ class TestCommandLine:
         assert cli.main(self.arguments(options, "small")) == 0
         text = capsys.readouterr().out
         assert text.count("all is well") == 2
-        assert text.count("cached") == len(NAMES)
+        assert text.count(" cached\n") == len(NAMES)
         assert "scored.parquet" in text
 
     def test_one_failing_case_does_not_stop_the_others(

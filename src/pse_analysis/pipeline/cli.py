@@ -97,11 +97,12 @@ def places(result: Result) -> list[tuple[str, str]]:
     for stage in NAMES:
         entry = result.entries.get(stage)
         if entry is not None:
-            names = ", ".join(name for name in entry.files if name.endswith(".parquet"))
-            found.append((stage, f"{_near(entry.folder)}/{{{names}}}"))
+            names = [name for name in entry.files if name.endswith(".parquet")]
+            joined = names[0] if len(names) == 1 else f"{{{','.join(names)}}}"
+            found.append((stage, f"{_near(entry.folder)}/{joined}"))
     if result.recordings:
         names = ", ".join(path.name for path in result.recordings)
-        found.append(("recording", f"{names} beside them: pse view {result.case.name}"))
+        found.append(("recordings", f"{names} beside them; open: pse view {result.case.name}"))
     notebook = result.case.notebook
     if notebook and (project_root() / notebook).is_file():
         found.append(("notebook", f"{_near(project_root() / notebook)}"))

@@ -70,7 +70,7 @@ STAGES = (
         "score",
         "pse_analysis.scoring",
         keys=("title", "study", "score"),
-        raw=("grid", "channels.parquet", "truth.parquet", "faults.parquet"),
+        raw=("grid", "truth.parquet", "faults.parquet"),
         tables=(
             ("validate", "validated"),
             ("estimate", "estimated"),

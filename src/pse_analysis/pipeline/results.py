@@ -20,7 +20,7 @@ from pse_analysis.pipeline.plan import NAMES, Options, Reporter, Result
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pse_analysis.telemetry import RawCase
+    from pse_analysis.grid.network import Network
 
 RAW_TABLES = ("telemetry", "channels", "truth", "sample_truth", "faults")
 
@@ -50,34 +50,32 @@ class Results(Mapping[str, "pd.DataFrame"]):
     recordings: Mapping[str, Path]
     summary: str
     _read: dict[str, pd.DataFrame] = field(default_factory=dict, repr=False, compare=False)
-    _raw: list[RawCase] = field(default_factory=list, repr=False, compare=False)
 
     @property
-    def raw(self) -> RawCase:
-        """The raw case: network, channels, telemetry and, where simulated, the truth."""
-        if not self._raw:
-            from pse_analysis.telemetry import read_raw
+    def network(self) -> Network:
+        """The grid."""
+        from pse_analysis.pipeline.tables import read_network
 
-            self._raw.append(read_raw(self.raw_folder))
-        return self._raw[0]
+        return read_network(self.raw_folder)
 
     def __getitem__(self, table: str) -> pd.DataFrame:
-        if table in RAW_TABLES:
-            frame: pd.DataFrame | None = getattr(self.raw, table)
-            if frame is None:
-                raise KeyError(table)
-            return frame
-        if table not in self.files:
-            raise KeyError(f"{table}: expected any of {', '.join(self)}")
         if table not in self._read:
-            from pse_analysis.pipeline.stages import read_table
+            from pse_analysis.pipeline.tables import read_raw_table
+            from pse_analysis.telemetry import read_table
 
-            try:
-                self._read[table] = read_table(table, self.files[table])
-            except FileNotFoundError as error:
+            if table not in set(self):
+                raise KeyError(f"{table}: expected any of {', '.join(self)}")
+            if table in self.files and not self.files[table].is_file():
                 raise TableError(
                     f"{self.files[table]} is gone: a later run replaced it; load the case again"
-                ) from error
+                )
+            frame = (
+                read_table(self.files[table], table)
+                if table in self.files
+                else read_raw_table(self.raw_folder, table)
+            )
+            assert frame is not None
+            self._read[table] = frame
         return self._read[table]
 
     def __iter__(self) -> Iterator[str]:

@@ -193,6 +193,7 @@ class _Run:
             f"{kind}/{name}": facts["digest"]
             for kind, folder in folders.items()
             for name, facts in describe_folder(folder).items()
+            if name.endswith((".parquet", ".csv"))
         }
 
     def _stage(

@@ -10,33 +10,27 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pse_analysis import recording
 from pse_analysis.alignment import AlignParams, align
-from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import EstimateParams, Method, estimate
 from pse_analysis.grid import library
 from pse_analysis.parameters import Study, build
 from pse_analysis.pipeline.case import Case
 from pse_analysis.pipeline.plan import SUMMARY, Job, Work
 from pse_analysis.pipeline.processes import each
-from pse_analysis.pipeline.summary import render
+from pse_analysis.pipeline.summary import markdown, text
+from pse_analysis.pipeline.tables import merge_files, read_network, read_raw_table
 from pse_analysis.scoring import ScoreParams, score
 from pse_analysis.simulation import SimulateParams, profiles, simulate
-from pse_analysis.telemetry import read_raw, write_raw
+from pse_analysis.telemetry import read_raw, read_table, write_raw, write_table
 from pse_analysis.validation import ValidateParams, validate
-from pse_analysis.vocabulary import KEYS, check
+from pse_analysis.vocabulary import check
 
 PARTS = ("estimated", "residuals", "steps")
-
-
-# --------------------------------------------------------------------------------------------------
-# Parameters and tables
-# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -84,64 +78,6 @@ def check_case(case: Case) -> Parameters:
     return parameters
 
 
-def read_table(
-    table: str, path: Path, filters: list[tuple[str, str, Any]] | None = None
-) -> pd.DataFrame:
-    """Read a parquet file and check it against the schema of its table.
-
-    Parameters
-    ----------
-    table
-        Name of the schema.
-    path
-        The file.
-    filters
-        Rows to keep, as `pyarrow.parquet.read_table` takes them.
-
-    Raises
-    ------
-    TableError
-        If it is not whole, or breaks the schema.
-    FileNotFoundError
-        If it is not there.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(2, "no such table", str(path))
-    try:
-        frame = pq.read_table(path, filters=filters, partitioning=None).to_pandas()
-    except (pa.ArrowInvalid, OSError) as error:
-        raise TableError(
-            f"{path}: not a whole parquet file ({error}): delete it and run the stage again"
-        ) from error
-    return check(table, frame)
-
-
-def write_table(table: str, path: Path, frame: pd.DataFrame) -> None:
-    """Check a table against its schema, sort it by its key, and write it as parquet.
-
-    The order and the settings are fixed, so that equal tables are equal files and the stages after
-    this one need not run again.
-    """
-    checked = check(table, frame)
-    ordered = checked.sort_values(list(KEYS[table]), kind="stable", ignore_index=True)
-    pq.write_table(pa.Table.from_pandas(ordered, preserve_index=False), path, compression="zstd")
-
-
-def merge_tables(paths: list[Path], target: Path) -> None:
-    """Join parquet files of one schema, one row group after another, and remove them."""
-    schema = pq.read_schema(paths[0])
-    with pq.ParquetWriter(target, schema, compression="zstd") as writer:
-        for path in paths:
-            writer.write_table(pq.read_table(path, partitioning=None).cast(schema))
-    for path in paths:
-        path.unlink()
-
-
-# --------------------------------------------------------------------------------------------------
-# Stages
-# --------------------------------------------------------------------------------------------------
-
-
 def _simulate(job: Job) -> None:
     params = check_case(job.case)
     assert params.simulate is not None
@@ -164,7 +100,7 @@ def _validate(job: Job) -> None:
         raw.telemetry, raw.channels, params.validate, history_end=params.study.start
     )
     job.progress(2, 4, "writing")
-    write_table("validated", job.output / "validated.parquet", validated)
+    write_table(job.output / "validated.parquet", validated, "validated")
     job.progress(3, 4, "recording")
     recording.validated(
         job.output / "validate.rrd",
@@ -180,19 +116,19 @@ def _validate(job: Job) -> None:
 def _align(job: Job) -> None:
     params = check_case(job.case)
     job.progress(0, 4, "reading")
-    raw = read_raw(job.raw)
-    validated = read_table("validated", job.inputs["validate"] / "validated.parquet")
+    network, channels = read_network(job.raw), _channels(job.raw)
+    validated = read_table(job.inputs["validate"] / "validated.parquet", "validated")
     job.progress(1, 4, "bringing samples to instants")
-    aligned = align(validated, raw.channels, raw.network, params.study, params.align)
+    aligned = align(validated, channels, network, params.study, params.align)
     job.progress(2, 4, "writing")
-    write_table("aligned", job.output / "aligned.parquet", aligned)
+    write_table(job.output / "aligned.parquet", aligned, "aligned")
     job.progress(3, 4, "recording")
     recording.aligned(
         job.output / "align.rrd",
         job.case.name,
         aligned,
-        raw.channels,
-        truth=raw.truth,
+        channels,
+        truth=read_raw_table(job.raw, "truth"),
         study=params.study,
     )
 
@@ -216,29 +152,31 @@ class EstimateTask:
 
 def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
     """Run one method on one trial; returns the file of each table."""
-    raw = read_raw(task.raw)
-    # Other trials are left on the disk; which variant to take is the method's business.
-    aligned = read_table("aligned", task.aligned, [("trial", "==", task.trial)])
+    # Other trials stay on the disk; which variant to take is the method's business.
+    aligned = check(
+        "aligned",
+        pq.read_table(task.aligned, filters=[("trial", "==", task.trial)]).to_pandas(),
+    )
     done = estimate(
         aligned,
-        raw.channels,
-        raw.network,
+        _channels(task.raw),
+        read_network(task.raw),
         task.study,
         task.method,
         trial=task.trial,
-        truth=raw.truth,
+        truth=read_raw_table(task.raw, "truth"),
     )
     for table in PARTS:
-        write_table(table, task.part(table), getattr(done, table))
+        write_table(task.part(table), getattr(done, table), table)
     return {table: task.part(table) for table in PARTS}
 
 
 def _estimate(job: Job) -> None:
     params = check_case(job.case)
     aligned = job.inputs["align"] / "aligned.parquet"
-    trials = np.unique(pq.read_table(aligned, columns=["trial"])["trial"].to_numpy())
+    trials = sorted(set(pq.read_table(aligned, columns=["trial"])["trial"].unique().to_pylist()))
     tasks = [
-        EstimateTask(params.study, method, number, int(trial), job.raw, aligned, job.output)
+        EstimateTask(params.study, method, number, trial, job.raw, aligned, job.output)
         for number, method in enumerate(params.estimate.methods)
         for trial in trials
     ]
@@ -247,29 +185,48 @@ def _estimate(job: Job) -> None:
     for done, _ in enumerate(each(run_estimate_task, tasks, job.workers), 1):
         job.progress(done, total, f"{done} of {len(tasks)} estimates")
     for table in PARTS:
-        merge_tables([task.part(table) for task in tasks], job.output / f"{table}.parquet")
+        merge_files([task.part(table) for task in tasks], job.output / f"{table}.parquet")
     job.progress(len(tasks), total, "recording")
+    tables = {name: read_table(job.output / f"{name}.parquet", name) for name in PARTS}
+    recording.estimated(
+        job.output / "estimate.rrd",
+        job.case.name,
+        tables["estimated"],
+        tables["steps"],
+        tables["residuals"],
+        aligned=read_table(aligned, "aligned"),
+        channels=_channels(job.raw),
+        network=read_network(job.raw),
+        truth=read_raw_table(job.raw, "truth"),
+        study=params.study,
+    )
 
 
 def _score(job: Job) -> None:
     params = check_case(job.case)
     job.progress(0, 3, "reading")
-    raw = read_raw(job.raw)
-    validated = read_table("validated", job.inputs["validate"] / "validated.parquet")
-    tables = {name: read_table(name, job.inputs["estimate"] / f"{name}.parquet") for name in PARTS}
+    truth, faults = read_raw_table(job.raw, "truth"), read_raw_table(job.raw, "faults")
+    validated = read_table(job.inputs["validate"] / "validated.parquet", "validated")
+    tables = {name: read_table(job.inputs["estimate"] / f"{name}.parquet", name) for name in PARTS}
     job.progress(1, 3, "comparing with the truth")
-    scored = score(
-        tables["estimated"],
-        tables["steps"],
-        tables["residuals"],
-        validated,
-        raw.truth,
-        raw.faults,
-        raw.channels,
-    )
-    write_table("scored", job.output / "scored.parquet", scored)
-    (job.output / SUMMARY).write_text(render(job.case.title, scored), encoding="utf-8")
+    scored = score(tables["estimated"], tables["steps"], validated, truth, faults, params.score)
+    write_table(job.output / "scored.parquet", scored, "scored")
+    (job.output / SUMMARY).write_text(text(job.case.title, scored), encoding="utf-8")
     job.progress(2, 3, "recording")
+    recording.scored(
+        job.output / "score.rrd",
+        job.case.name,
+        scored,
+        tables["estimated"],
+        truth,
+        read_network(job.raw),
+        summary_markdown=markdown(job.case.title, scored),
+        study=params.study,
+    )
+
+
+def _channels(raw: Path) -> pd.DataFrame:
+    return read_table(raw / "channels.parquet", "channels")
 
 
 WORK: Work = MappingProxyType(

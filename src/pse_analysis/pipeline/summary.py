@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pandas as pd
 from rich import box
 from rich.console import Console
@@ -15,39 +14,39 @@ from rich.table import Table
 WIDTH = 100
 NOTHING = "–"
 
-Shown = tuple[str, str, Callable[[pd.Series], float], str]
-"""Metric, heading, how trials become one number, and format."""
 
-
-def _mean(values: pd.Series) -> float:
+def _mean(values: pd.Series[float]) -> float:
     return float(values.mean())
 
 
-def _largest(values: pd.Series) -> float:
+def _largest(values: pd.Series[float]) -> float:
     return float(values.max())
 
 
-def _sum(values: pd.Series) -> float:
+def _sum(values: pd.Series[float]) -> float:
     return float(values.sum(min_count=1))
 
 
-COLUMNS: tuple[Shown, ...] = (
-    ("vm_error_mean", "|V| error\nmean\n[1e-3 pu]", _mean, ".3f"),
-    ("vm_error_max", "\nlargest\n[1e-3 pu]", _largest, ".2f"),
-    ("va_error_mean", "angle error\nmean\n[1e-3 deg]", _mean, ".2f"),
-    ("va_error_max", "\nlargest\n[1e-3 deg]", _largest, ".1f"),
-    ("nis_ratio", "NIS/m", _mean, ".2f"),
-    ("coverage_vm", "in ±2σ\n|V|", _mean, ".1%"),
-    ("coverage_va", "in ±2σ\nangle", _mean, ".1%"),
+COLUMNS: tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...] = (
+    ("vm_error_mean", "|V| error\nmean", _mean, ".3f"),
+    ("vm_error_max", "|V| error\nlargest", _largest, ".2f"),
+    ("va_error_mean", "∠V error\nmean", _mean, ".1f"),
+    ("va_error_max", "∠V error\nlargest", _largest, ".0f"),
+    ("nis_ratio", "\nNIS/m", _mean, ".2f"),
+    ("coverage_vm", "|V| in\n±2σ", _mean, ".1%"),
+    ("coverage_va", "∠V in\n±2σ", _mean, ".1%"),
     ("steps_not_ok", "steps\nnot ok", _sum, ".0f"),
-    ("seconds", "time\n[s]", _sum, ".2f"),
+    ("seconds", "time\n[s]", _sum, ".1f"),
 )
+"""Metric, heading, how trials become one number, and format."""
+
+UNITS = "errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
 
 # Errors are small: shown in thousandths, and angles in degrees, as everywhere a person reads them.
 _SCALE = {"pu": 1e3, "rad": 1e3 * 180.0 / math.pi, "degree": 1e3}
 
 
-def render(title: str, scored: pd.DataFrame) -> str:
+def text(title: str, scored: pd.DataFrame) -> str:
     """Scores of the methods and of the checks, as plain text.
 
     Parameters
@@ -58,27 +57,32 @@ def render(title: str, scored: pd.DataFrame) -> str:
         Table of that name; only rows of the whole case (element "") are shown, and trials are
         brought together: largest errors by their maximum, times by their sum, others by their mean.
     """
-    whole = scored[scored["element"] == ""]
-    estimates = whole[whole["method"] != "validate"]
-    trials = estimates["trial"].nunique()
-    caption = f"{trials} trial{'s' if trials != 1 else ''}"
-    table = Table(title=f"{title} ({caption})", title_style="", box=box.SIMPLE_HEAD)
-    table.add_column("method", vertical="bottom")
+    table = Table(title=_title(title, scored), title_style="", box=box.SIMPLE_HEAD)
+    table.add_column("\nmethod", no_wrap=True)
     for _, heading, _, _ in COLUMNS:
-        table.add_column(heading, justify="right")
-    for method in dict.fromkeys(estimates["method"]):
-        rows = estimates[estimates["method"] == method]
-        table.add_row(str(method), *(_cell(rows, shown) for shown in COLUMNS))
-    text = io.StringIO()
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in _rows(scored):
+        table.add_row(*row)
+    stored = io.StringIO()
     # A fixed width and no colours: the text is stored, and read again by runs of any terminal.
-    console = Console(file=text, width=WIDTH, color_system=None, force_terminal=False)
+    console = Console(file=stored, width=WIDTH, color_system=None, force_terminal=False)
     console.print(table)
-    console.print(detection(whole[whole["method"] == "validate"]), highlight=False)
-    return "\n".join(line.rstrip() for line in text.getvalue().strip("\n").splitlines()) + "\n"
+    console.print(detection(scored), highlight=False)
+    return "\n".join(line.rstrip() for line in stored.getvalue().strip("\n").splitlines()) + "\n"
 
 
-def detection(rows: pd.DataFrame) -> str:
+def markdown(title: str, scored: pd.DataFrame) -> str:
+    """The same for the page of a recording."""
+    head = ["method", *(" ".join(heading.split()) for _, heading, _, _ in COLUMNS)]
+    rule = ["---", *("---:" for _ in COLUMNS)]
+    lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in _rows(scored)]
+    table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
+    return "\n".join([f"# {_title(title, scored)}", "", *table, *lines, "", detection(scored)])
+
+
+def detection(scored: pd.DataFrame) -> str:
     """One line on the faults of telemetry: found, missed and false alarms, over all trials."""
+    rows = scored[(scored["method"] == "validate") & (scored["element"] == "")]
 
     def total(metric: str) -> float:
         return float(rows.loc[rows["metric"] == metric, "value"].sum())
@@ -95,9 +99,21 @@ def detection(rows: pd.DataFrame) -> str:
     )
 
 
-def _cell(rows: pd.DataFrame, shown: Shown) -> str:
-    metric, _, together, form = shown
-    chosen = rows[rows["metric"] == metric]
-    values = chosen["value"].astype(float) * chosen["unit"].map(_SCALE).fillna(1.0).astype(float)
-    value = together(values) if len(values) else np.nan
-    return NOTHING if not np.isfinite(value) else format(value, form)
+def _title(title: str, scored: pd.DataFrame) -> str:
+    trials = scored.loc[scored["method"] != "validate", "trial"].nunique()
+    return f"{title} ({trials} trial{'s' if trials != 1 else ''}; {UNITS})"
+
+
+def _rows(scored: pd.DataFrame) -> list[list[str]]:
+    whole = scored[(scored["element"] == "") & (scored["method"] != "validate")]
+    found = []
+    for method in dict.fromkeys(whole["method"]):
+        own = whole[whole["method"] == method]
+        cells = [str(method)]
+        for metric, _, together, form in COLUMNS:
+            rows = own[own["metric"] == metric]
+            scale = rows["unit"].map(_SCALE).fillna(1.0).astype(float)
+            value = together(rows["value"].astype(float) * scale) if len(rows) else math.nan
+            cells.append(format(value, form) if math.isfinite(value) else NOTHING)
+        found.append(cells)
+    return found
