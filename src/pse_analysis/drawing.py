@@ -62,21 +62,20 @@ REASONS: MappingProxyType[Reason, str] = MappingProxyType(
 
 _OTHERS = (PURPLE, SKY, VERMILION, YELLOW, GREY)
 
-# Ten steps of matplotlib's "cividis" reversed: dark means a large value on paper and the order of
-# lightness survives any colour vision and a grey printer. Written out so that a recording does not
-# import matplotlib.
+# Steps of matplotlib's "viridis", whose order of lightness survives any colour vision and a grey
+# printer; its darkest end is left out because it vanishes on a dark screen. Written out so that a
+# recording does not import matplotlib.
 _SEQUENTIAL = np.array(
     [
-        (0, 34, 78),
-        (18, 53, 112),
-        (59, 73, 108),
-        (87, 93, 109),
-        (112, 113, 115),
-        (138, 134, 120),
-        (165, 156, 116),
-        (195, 179, 105),
-        (225, 204, 85),
-        (254, 232, 56),
+        (72, 40, 120),
+        (62, 74, 137),
+        (49, 104, 142),
+        (38, 130, 142),
+        (31, 158, 137),
+        (53, 183, 121),
+        (110, 206, 88),
+        (181, 222, 43),
+        (253, 231, 37),
     ],
     dtype=np.float64,
 )
@@ -109,7 +108,7 @@ def method_colours(methods: Iterable[str]) -> dict[str, str]:
 
 
 def sequential(values: npt.ArrayLike, largest: float) -> npt.NDArray[np.uint8]:
-    """Colours from dark blue (0) to yellow (`largest` and above); grey where there is no value.
+    """Colours from violet (0) to yellow (`largest` and above); grey where there is no value.
 
     Parameters
     ----------
@@ -127,7 +126,7 @@ def sequential(values: npt.ArrayLike, largest: float) -> npt.NDArray[np.uint8]:
     at = np.clip(np.nan_to_num(v) / largest if largest > 0 else np.zeros_like(v), 0.0, 1.0)
     steps = np.arange(len(_SEQUENTIAL)) / (len(_SEQUENTIAL) - 1)
     rgb = np.stack([np.interp(at, steps, _SEQUENTIAL[:, band]) for band in range(3)], axis=-1)
-    rgb[~np.isfinite(v)] = (110.0, 110.0, 110.0)
+    rgb[~np.isfinite(v)] = (120.0, 120.0, 120.0)
     return np.round(rgb).astype(np.uint8)
 
 

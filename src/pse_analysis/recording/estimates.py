@@ -24,10 +24,7 @@ BOUNDS = (0.005, 0.995)
 """Quantiles of chi-square between which NIS should lie 99 times in 100."""
 
 _STATUS = {"ok": GREEN, "predicted": GREY, "restarted": ORANGE}
-_COLOUR_SCALE = (
-    "The grid shows the instant of the time cursor: dark blue is no error, yellow the end of the "
-    "scale below it, grey not known. Drag the cursor, or press play, to watch the day."
-)
+_UNIT = "10⁻³ p.u."
 
 
 def estimated(
@@ -85,6 +82,7 @@ def estimated(
     shades = _errors(vm, true, network)
     largest = marks.scale_end(pd.concat(shades.values())) if shades else 1.0
     what = "error of |V|" if true is not None else "σ of |V|"
+    scale = f"0 … {1e3 * largest:g} {_UNIT}"
 
     buses = []
     for element in chosen:
@@ -92,10 +90,11 @@ def estimated(
         origin = marks.entity_path("vm", element)
         buses.append(window.plot(origin, f"{element.replace('/', ' ')} |V| [p.u.]", own.value))
     everything = [
-        window.plot(f"normalised/{name}", f"{name}: innovation / σ [1]", [-5.0, 5.0], legend=False)
+        window.plot(f"normalised/{name}", f"{name}: innovation / σ [1]", [-6.0, 6.0], legend=False)
         for name in methods
     ]
     top = float(np.nanquantile(nis, 0.995)) if nis.size and nis.notna().any().any() else 1.0
+    graphs = [marks.grid_view(f"grid/{n}", f"{n}: {what}, {scale}", network) for n in shades]
     blueprint = marks.panels(
         rrb.Horizontal(
             rrb.Vertical(
@@ -108,10 +107,7 @@ def estimated(
                 row_shares=[5, 3, 3],
             ),
             rrb.Vertical(
-                rrb.Tabs(
-                    *(marks.grid_view(f"grid/{n}", f"{what}: {n}", network) for n in shades),
-                    active_tab=len(shades) - 1,
-                ),
+                rrb.Tabs(*graphs, active_tab=len(graphs) - 1),
                 rrb.TextDocumentView(origin="text/estimated", name="what is to be seen"),
                 row_shares=[2, 3],
             ),
@@ -132,7 +128,13 @@ def estimated(
             marks.lane(stream, f"status/{name}", times, one.status.tolist(), colours)
         for name, values in shades.items():
             marks.grid(
-                stream, f"grid/{name}", network, values, largest=largest, scale=1e3, unit="mp.u."
+                stream,
+                f"grid/{name}",
+                network,
+                values,
+                largest=largest,
+                scale=1e3,
+                unit=_UNIT,
             )
         text = _estimated_text(case, trial, step, score, nis, what, largest, true is not None)
         marks.page(stream, "text/estimated", text)
@@ -157,9 +159,9 @@ def _draw_bus(
         frame = pd.DataFrame({f"measured, {source}": part.value_pu.to_numpy()}, index=part.time_utc)
         colour = SOURCES.get(str(source), GREY)
         marks.dots(stream, f"{entity}/2_measured/{source}", frame, [colour], 2.2)
-    for name, colour in methods.items():
+    for number, (name, colour) in enumerate(methods.items(), start=3):
         one = vm[(vm.element == element) & (vm.method == name)].set_index("time_utc")
-        marks.band(stream, f"{entity}/3_{name}", one.value, one.sigma, f"{name} ±σ", colour)
+        marks.band(stream, f"{entity}/{number}_{name}", one.value, one.sigma, f"{name} ±σ", colour)
 
 
 def _draw_nis(
@@ -183,7 +185,8 @@ def _ratio(step: pd.DataFrame) -> pd.DataFrame:
     """NIS over its degrees of freedom, one column per method."""
     known = step[step.dof > 0]
     ratio = known.assign(ratio=known.nis / known.dof)
-    return ratio.pivot_table(index="time_utc", columns="method", values="ratio")
+    table = ratio.pivot_table(index="time_utc", columns="method", values="ratio")
+    return table.reindex(columns=[name for name in dict.fromkeys(step.method) if name in table])
 
 
 def _voltages(table: pd.DataFrame, trial: int) -> pd.DataFrame:
@@ -255,9 +258,17 @@ def _estimated_text(
             "**Below**: NIS over its degrees of freedom, which should be about 1 and leave the "
             "grey bounds once in a hundred instants. A method above them trusts itself too much. "
             "The other tab tells how each step ended.",
-            f"**Grid**, a tab per method: {what}, the scale ends at {1e3 * largest:g} mp.u. "
-            + _COLOUR_SCALE,
+            f"**Grid**, a tab per method: {what}. {_grid_text(largest)}",
         ]
+    )
+
+
+def _grid_text(largest: float) -> str:
+    end = 1e3 * largest
+    return (
+        f"The colours are those of the time cursor: violet is 0, yellow {end:g} {_UNIT} or more, "
+        f"grey not known; the discs below the grid show the scale in steps of {end / 5:g}. Point "
+        "at a bus for its name. Drag the cursor, or press play, to watch the day."
     )
 
 
@@ -299,6 +310,7 @@ def scored(
     shades = _errors(vm, true, network)
     largest = marks.scale_end(pd.concat(shades.values())) if shades else 1.0
     what = "error of |V|" if true is not None else "σ of |V|"
+    scale = f"0 … {1e3 * largest:g} {_UNIT}"
     over_time = {
         "mean": 1e3 * pd.DataFrame({name: v.mean(axis=1) for name, v in shades.items()}),
         "largest": 1e3 * pd.DataFrame({name: v.max(axis=1) for name, v in shades.items()}),
@@ -308,26 +320,35 @@ def scored(
         index="element", columns="method", values="value"
     ).reindex([f"bus/{name}" for name in network.buses.name])  # fmt: skip
 
-    views: list[rrb.View | rrb.Container] = [
-        rrb.Horizontal(
-            *(marks.grid_view(f"score_grid/{n}", f"{what}: {n}", network) for n in shades)
-        ),
+    plots: list[rrb.View | rrb.Container] = [
         rrb.Tabs(
             *(
-                window.plot(f"error/{kind}", f"{kind} {what} over the buses [mp.u.]", v, zero=True)
+                window.plot(
+                    f"error/{kind}", f"{kind} {what} over the buses [{_UNIT}]", v, zero=True
+                )
                 for kind, v in over_time.items()
             )
-        ),
+        )
     ]
     if bars.notna().any().any():
-        views.append(
-            rrb.BarChartView(origin="error/by_bus", name="mean error of |V| by bus [mp.u.]")
+        plots.append(
+            rrb.BarChartView(
+                origin="error/by_bus",
+                name=f"mean error of |V| by bus [{_UNIT}]",
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
         )
     blueprint = marks.panels(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="text/scored", name="score"),
-            rrb.Vertical(*views),
-            column_shares=[2, 4],
+            rrb.Vertical(
+                *(
+                    marks.grid_view(f"score_grid/{n}", f"{n}: {what}, {scale}", network)
+                    for n in shades
+                )
+            ),
+            rrb.Vertical(*plots),
+            column_shares=[5, 7, 7],
         )
     )
     with marks.recording(path, case, blueprint) as stream:
@@ -336,19 +357,19 @@ def scored(
         for name, values in shades.items():
             marks.grid(
                 stream, f"score_grid/{name}", network, values,
-                largest=largest, scale=1e3, unit="mp.u.",
+                largest=largest, scale=1e3, unit=_UNIT,
             )  # fmt: skip
-        for name in [n for n in methods if n in bars]:
-            marks.bars(stream, f"error/by_bus/{name}", bars[name].to_numpy(), methods[name])
+        marks.bars(stream, "error/by_bus", bars[[n for n in methods if n in bars]], methods)
         guide = [
             summary_markdown.strip(),
             "## What is to be seen",
             f"The drawings show trial {trial} of the case.",
-            f"**Grid**: {what} of each method on one scale that ends at {1e3 * largest:g} mp.u. "
-            + _COLOUR_SCALE,
-            f"**Middle**: mean {what} over the buses at each instant; the other tab has the "
-            "largest.",
+            f"**Grid**: {what} of each method on one scale. {_grid_text(largest)}",
+            f"**Right**: mean {what} over the buses at each instant; another tab has the largest.",
         ]
         if bars.notna().any().any():
-            guide.append("**Below**: the mean over the study, bus by bus.")
+            guide.append(
+                "**Right, below**: the mean over the study in the order of the buses, "
+                "with the colours of the plot above it."
+            )
         marks.page(stream, "text/scored", "\n\n".join(guide))

@@ -26,11 +26,12 @@ TIMELINE = "time"
 TRUTH = "#B4B4B4"
 BOUND = "#8C8C8C"
 
-# The graph view takes positions as screen points and draws text at a fixed size: this is the
-# distance between neighbours at which a bus name fits inside its node.
-_HOP = 46.0
-_DISC = 13.0
-_ABOVE = 26.0
+# Of the grid's drawing: distance of neighbours, radius of a bus, and the row of discs below it
+# that is its colour scale.
+_HOP = 40.0
+_DISC = 14.0
+_SCALE_STEP = 2.2 * _DISC
+_N_TICK = 6
 
 
 @contextmanager
@@ -241,70 +242,51 @@ def grid(
     names = list(network.buses.name)
     live = network.branches.in_service
     pairs = zip(network.branches.from_bus[live], network.branches.to_bus[live], strict=True)
-    # A node with text shows its colour in the letters only, so the names are nodes of their own.
-    stream.log(
-        entity,
-        rr.GraphNodes(node_ids=names, positions=at, radii=[_DISC] * len(names), show_labels=False),
-        rr.GraphEdges(edges=[(names[i], names[j]) for i, j in pairs], graph_type="undirected"),
-        static=True,
+    ticks = np.linspace(0.0, largest, _N_TICK)
+    foot = np.stack([_SCALE_STEP * np.arange(_N_TICK), np.full(_N_TICK, 1.8 * _HOP)], axis=1)
+    # Discs carry no text: a node with text shows its colour in the letters only, and a second
+    # entity with the names would be framed by the viewer. Pointing at a disc tells its name.
+    nodes = rr.GraphNodes(
+        node_ids=[*names, *(f"scale: {tick * scale:g} {unit}" for tick in ticks)],
+        positions=np.concatenate([at, foot]),
+        radii=[_DISC] * (len(names) + _N_TICK),
+        show_labels=False,
     )
-    _words(stream, f"{entity}/names", at - [0.0, _ABOVE], names)
+    edges = [(names[i], names[j]) for i, j in pairs]
+    stream.log(entity, nodes, rr.GraphEdges(edges=edges, graph_type="undirected"), static=True)
     rgb = sequential(values.to_numpy(dtype=np.float64), largest)
+    key = np.broadcast_to(sequential(ticks, largest), (len(rgb), _N_TICK, 3))
+    colours = np.concatenate([rgb, key], axis=1)
     stream.send_columns(
         entity,
         indexes=[time_column(pd.DatetimeIndex(values.index))],
-        columns=rr.GraphNodes.columns(colors=_packed(rgb)).partition([len(names)] * len(values)),
-    )
-    ticks = np.linspace(0.0, largest, 6)
-    foot = np.stack(
-        [np.linspace(0.0, 5 * 1.7 * _HOP, 6), np.full(6, at[:, 1].max() + 1.8 * _HOP)], axis=1
-    )
-    stream.log(
-        f"{entity}/scale",
-        rr.GraphNodes(
-            node_ids=[f"scale {i}" for i in range(6)],
-            positions=foot,
-            colors=_packed(sequential(ticks, largest)),
-            radii=[_DISC] * 6,
-            show_labels=False,
+        columns=rr.GraphNodes.columns(colors=_packed(colours)).partition(
+            [colours.shape[1]] * len(colours)
         ),
-        static=True,
     )
-    texts = [f"{tick * scale:g}" for tick in ticks]
-    texts[-1] += f" {unit}"
-    _words(stream, f"{entity}/scale/names", foot + [0.0, _ABOVE], texts)
 
 
 def grid_view(origin: str, name: str, network: Network) -> rrb.GraphView:
     """A view that holds the whole of what `grid` draws."""
     xy = layout(network)
     wide, high = (xy.max(axis=0) - xy.min(axis=0)) * _HOP
-    wide = max(wide, 5 * 1.7 * _HOP + 40.0)
-    bounds = rrb.VisualBounds2D(x_range=(-60.0, wide + 60.0), y_range=(-high - 70.0, 140.0))
+    wide = max(wide, _N_TICK * _SCALE_STEP)
+    bounds = rrb.VisualBounds2D(x_range=(-40.0, wide + 40.0), y_range=(-high - 40.0, 2.8 * _HOP))
     return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
 
 
-def _words(
-    stream: rr.RecordingStream,
-    entity: str,
-    at: npt.NDArray[np.float64],
-    texts: Sequence[str],
+def bars(
+    stream: rr.RecordingStream, entity: str, values: pd.DataFrame, colours: Mapping[str, str]
 ) -> None:
-    nodes = rr.GraphNodes(
-        node_ids=[f"{entity} {i}" for i in range(len(texts))],
-        positions=at,
-        labels=texts,
-        colors=[_rgb("#9A9A9A")] * len(texts),
-        show_labels=True,
-    )
-    stream.log(entity, nodes, static=True)
-
-
-def bars(stream: rr.RecordingStream, entity: str, values: npt.ArrayLike, colour: str) -> None:
-    """One row of bars, numbered from 1."""
-    height = np.nan_to_num(np.asarray(values, dtype=np.float64))
-    chart = rr.BarChart(height, abscissa=np.arange(1, len(height) + 1), color=_rgb(colour))
-    stream.log(entity, chart, static=True)
+    """Bars side by side: a group per row, numbered from 1, and in it a bar per column."""
+    share = 0.8 / max(values.shape[1], 1)
+    for number, name in enumerate(values.columns):
+        height = np.nan_to_num(values[name].to_numpy(dtype=np.float64))
+        left = np.arange(1, len(height) + 1) + share * (number - (values.shape[1] - 1) / 2)
+        chart = rr.BarChart(
+            height, abscissa=left, widths=[share] * len(height), color=_rgb(colours[name])
+        )
+        stream.log(f"{entity}/{name}", chart, static=True)
 
 
 def page(stream: rr.RecordingStream, entity: str, markdown: str) -> None:
