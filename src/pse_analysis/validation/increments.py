@@ -74,30 +74,6 @@ def autocorrelation(variance: npt.ArrayLike) -> Array:
         return np.asarray(np.where(v[..., 1:2] > 0.0, second / (2.0 * v[..., 1:2]), 0.0))
 
 
-def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> Array:
-    """v(0 … n_lag) from σ and ρ_1, ρ_2, …: v(m) = σ²(m + 2Σ_{i<m}(m−i)ρ_i).
-
-    Parameters
-    ----------
-    sigma : (...,) array_like
-        Standard deviation of the one-period increment. [unit]
-    rho : (..., n) array_like
-        Its autocorrelation from lag 1; 0 beyond n.
-    n_lag : int
-
-    Returns
-    -------
-    (..., n_lag + 1) ndarray
-        [unit²]
-    """
-    r = np.atleast_1d(np.asarray(rho, dtype=float))
-    m = np.arange(n_lag + 1)[:, None]
-    i = np.arange(1, r.shape[-1] + 1)[None, :]
-    weight = np.maximum(m - i, 0)
-    s2 = np.square(np.asarray(sigma, dtype=float))[..., None]
-    return np.asarray(s2 * (np.arange(n_lag + 1) + 2.0 * (r @ weight.T)))
-
-
 def learn(
     value: npt.ArrayLike,
     time: npt.ArrayLike,

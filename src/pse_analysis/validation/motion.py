@@ -90,6 +90,70 @@ def given(threshold: npt.ArrayLike, n_channel: int, confirm: int | npt.ArrayLike
     )
 
 
+def extrapolating(
+    threshold: npt.ArrayLike,
+    k: npt.ArrayLike,
+    n_channel: int,
+    confirm: int | npt.ArrayLike = 2,
+    n_lag: int = 8,
+) -> Motion:
+    """Motion of a stated extrapolation threshold per period.
+
+    Parameters
+    ----------
+    threshold : float or (n_channel,)
+        γ of eq. (12). [unit]
+    k : float or (n_channel,)
+        Coefficient of the last increment.
+    n_channel : int
+    confirm : int or (n_channel,)
+        Samples that must agree with a flagged one before a step is accepted.
+    n_lag : int
+        Lags after which increments count as uncorrelated.
+
+    Notes
+    -----
+    Over gaps the increments count as AR(1) with ρ_j = k^j, of which k is the best coefficient;
+    where |k| ≥ 1 is none's, as uncorrelated.
+    """
+    gamma = np.broadcast_to(np.asarray(threshold, dtype=float), (n_channel,))
+    coefficient = np.broadcast_to(np.asarray(k, dtype=float), (n_channel,)).copy()
+    rho = np.where(np.abs(coefficient) < 1.0, coefficient, 0.0)
+    shape = gap_variance(np.ones(n_channel), rho[:, None] ** np.arange(1.0, n_lag + 1.0), n_lag)
+    error = 1.0 + coefficient**2 - 2.0 * coefficient * rho
+    return Motion(
+        structure=shape * (np.square(gamma) / error)[:, None],
+        k=coefficient,
+        increment=np.full(n_channel, np.inf),
+        extrapolation=np.ones(n_channel),
+        confirm=np.broadcast_to(np.asarray(confirm, dtype=np.int64), (n_channel,)).copy(),
+    )
+
+
+def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> Array:
+    """v(0 … n_lag) from σ and ρ_1, ρ_2, …: v(m) = σ²(m + 2Σ_{i<m}(m−i)ρ_i).
+
+    Parameters
+    ----------
+    sigma : (...,) array_like
+        Standard deviation of the one-period increment. [unit]
+    rho : (..., n) array_like
+        Its autocorrelation from lag 1; 0 beyond n.
+    n_lag : int
+
+    Returns
+    -------
+    (..., n_lag + 1) ndarray
+        [unit²]
+    """
+    r = np.atleast_1d(np.asarray(rho, dtype=float))
+    m = np.arange(n_lag + 1)[:, None]
+    i = np.arange(1, r.shape[-1] + 1)[None, :]
+    weight = np.maximum(m - i, 0)
+    s2 = np.square(np.asarray(sigma, dtype=float))[..., None]
+    return np.asarray(s2 * (np.arange(n_lag + 1) + 2.0 * (r @ weight.T)))
+
+
 def times_sigma(quantile: Array, sigma: Array) -> Array:
     """k·σ with ∞·0 = ∞: a check that is not made has no threshold."""
     with np.errstate(invalid="ignore"):
