@@ -101,8 +101,10 @@ def check_shunts(telemetry: pd.DataFrame, channels: pd.DataFrame, network: Netwo
     Other tools report a bus result as load plus shunt; here the shunt belongs to the grid model,
     and copying such results is a silent error. The check compares medians at buses without
     generation that have a shunt, an injection channel and a voltage channel: it refuses when the
-    injection lies within a tenth of the shunt's power of *some share (0 … 1.5) of the nominal load
-    plus the shunt*, and further than half of the shunt's power from any such share without it.
+    injection lies within a tenth of the shunt's power of *a credible load plus the shunt*, and
+    further than half of the shunt's power from any credible load alone. A credible load is 0 … 1.5
+    of the nominal one; for Q, where P is measured too, 0.8 … 1.25 of the nominal Q times the share
+    of the nominal P.
 
     Parameters
     ----------
@@ -136,13 +138,18 @@ def check_shunts(telemetry: pd.DataFrame, channels: pd.DataFrame, network: Netwo
         voltage = by_quantity.get(Quantity.VM_PU)
         if voltage is None or not len(voltage):
             continue
+        share = (0.0, 1.5)
+        power = by_quantity.get(Quantity.P_MW)
+        if power is not None and len(power) and buses.p_load_mw[i] > 0:
+            measured = max(float(-np.median(power) / buses.p_load_mw[i]), 0.0)
+            share = (0.8 * measured, 1.25 * measured)
         square = float(np.median(voltage)) ** 2 * network.base_mva
-        for quantity, nominal, shunt, unit in (
-            (Quantity.P_MW, -buses.p_load_mw[i], -buses.g_shunt_pu[i] * square, "MW"),
-            (Quantity.Q_MVAR, -buses.q_load_mvar[i], buses.b_shunt_pu[i] * square, "Mvar"),
+        for quantity, nominal, shares, shunt, unit in (
+            (Quantity.P_MW, -buses.p_load_mw[i], (0, 1.5), -buses.g_shunt_pu[i] * square, "MW"),
+            (Quantity.Q_MVAR, -buses.q_load_mvar[i], share, buses.b_shunt_pu[i] * square, "Mvar"),
         ):
             for value in by_quantity.get(quantity, ()):
-                low, high = sorted((0.0, 1.5 * float(nominal)))
+                low, high = sorted(s * float(nominal) for s in shares)
                 plain = abs(value - np.clip(value, low, high))
                 with_shunt = abs(value - shunt - np.clip(value - shunt, low, high))
                 if with_shunt < 0.1 * abs(shunt) and plain > 0.5 * abs(shunt):

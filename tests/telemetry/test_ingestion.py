@@ -1,0 +1,210 @@
+"""Claim: tables of one's own come out in this project's names, units, signs and times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from simulated_case import feeder
+
+from pse_analysis.errors import TableError
+from pse_analysis.grid import library, power_flow
+from pse_analysis.measurement import SensorLayout
+from pse_analysis.telemetry import ingest, read_raw, write_raw
+
+T = pd.Timestamp("2016-06-09T08:00:00Z")
+
+
+def channels() -> pd.DataFrame:
+    """A utility's own description: kV, kW of consumption, ampere."""
+    return pd.DataFrame(
+        {
+            "channel": ["U6", "PV6", "I6"],
+            "source": ["scada", "ami", "pmu"],
+            "quantity": ["vm_pu", "p_mw", "i_ka"],
+            "element": ["bus/6", "bus/6", "branch/6-7"],
+            "side": ["", "", "from"],
+            "unit": ["kV", "kW", "A"],
+            "sigma": [0.05, 0.01, 1],
+            "sigma_kind": ["absolute", "relative", "absolute"],
+            "lower": [11.0, -10.0, 0.0],
+            "upper": [14.0, 300.0, 500.0],
+            "period_s": [60, 900, 60],
+            "sign": [1, -1, 1],
+        }
+    )
+
+
+def frame(**change: object) -> pd.DataFrame:
+    times = [T + pd.Timedelta(seconds=s) for s in (0, 60, 0, 900, 0, 60)]
+    return pd.DataFrame(
+        {
+            "channel": ["U6", "U6", "PV6", "PV6", "I6", "I6"],
+            "time_utc": times,
+            "value": [12.66, 12.5, 60.0, 80.0, 120.0, 125.0],
+        }
+    ).assign(**change)
+
+
+def test_units_and_signs_are_those_of_this_project():
+    raw = ingest(frame(), channels(), feeder())
+    value = raw.telemetry.set_index(["channel", "seq"]).value
+    assert value["U6", 0] == pytest.approx(1.0)
+    assert value["PV6", 1] == pytest.approx(-0.080)
+    assert value["I6", 0] == pytest.approx(0.120)
+    c = raw.channels.set_index("channel")
+    assert list(c.unit) == ["pu", "mw", "ka"]
+    assert set(c.sign) == {1}
+    assert c.sigma["U6"] == pytest.approx(0.05 / 12.66)
+    assert c.sigma["PV6"] == 0.01
+    assert c.sigma["I6"] == pytest.approx(1e-3)
+    assert (c.lower["PV6"], c.upper["PV6"]) == pytest.approx((-0.3, 0.01))
+    assert c.upper["U6"] == pytest.approx(14.0 / 12.66)
+    assert set(c.aggregation) == {"instant"}
+
+
+def test_per_unit_values_are_the_same_before_and_after():
+    given = channels().assign(
+        unit=["kv", "kw", "a"], sign=np.array([1, -1, 1], "int8"), aggregation="instant"
+    )
+    raw = ingest(frame(), channels(), feeder())
+    before = SensorLayout.from_channels(given, feeder()).to_per_unit(np.array([12.5, 80.0, 125.0]))
+    last = raw.telemetry[raw.telemetry.seq == 1].set_index("channel").value
+    after = SensorLayout.from_channels(raw.channels, feeder()).to_per_unit(
+        last[["U6", "PV6", "I6"]].to_numpy()
+    )
+    np.testing.assert_allclose(after, before, rtol=1e-14)
+
+
+def test_own_names_are_translated():
+    own = frame().rename(columns={"time_utc": "TS", "channel": "TAG", "value": "VAL"})
+    own["TAG"] = own["TAG"].map({"U6": "K-0006/U", "PV6": "Z77", "I6": "I6"})
+    raw = ingest(
+        own,
+        channels(),
+        feeder(),
+        columns={"TS": "time_utc", "TAG": "channel", "VAL": "value"},
+        tags={"K-0006/U": "U6", "Z77": "PV6"},
+    )
+    assert set(raw.telemetry.channel) == {"U6", "PV6", "I6"}
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_times_of_any_zone_and_resolution_become_utc_microseconds(unit: str):
+    local = frame().time_utc.dt.tz_convert("Europe/Berlin").dt.as_unit(unit)
+    for times, zone in ((local, None), (local.dt.tz_localize(None), "Europe/Berlin")):
+        raw = ingest(frame(time_utc=times), channels(), feeder(), timezone=zone)
+        assert str(raw.telemetry.time_utc.dtype) == "datetime64[us, UTC]"
+        assert raw.telemetry.time_utc.min() == T
+
+
+def test_seq_is_the_order_of_arrival():
+    late = frame().time_utc + pd.to_timedelta([500, 5, 60, 60, 1, 1], unit="s")
+    raw = ingest(frame(arrival_utc=late), channels(), feeder())
+    voltage = raw.telemetry[raw.telemetry.channel == "U6"]
+    assert list(voltage.seq) == [0, 1]
+    assert list(voltage.value * 12.66) == pytest.approx([12.5, 12.66])
+    unknown = ingest(frame().iloc[::-1], channels(), feeder()).telemetry
+    assert list(unknown[unknown.channel == "U6"].value * 12.66) == pytest.approx([12.5, 12.66])
+    assert unknown.arrival_utc.isna().all()
+
+
+def test_trials_and_quality_codes_are_kept():
+    raw = ingest(
+        frame(trial=[0, 1, 0, 1, 0, 1], quality=[192, None, 0, 0, 0, 0]), channels(), feeder()
+    )
+    assert (raw.telemetry.seq == 0).all()
+    assert raw.telemetry.quality.isna().sum() == 1
+
+
+def test_faulty_samples_stay_as_they_are():
+    bad = frame(value=[np.nan, np.inf, -np.inf, 1.0, 1.0, 1.0], time_utc=[T] * 6)
+    raw = ingest(bad, channels(), feeder())
+    assert len(raw.telemetry) == 6
+    assert raw.telemetry.value.isna().sum() == 1
+    assert np.isinf(raw.telemetry.value).sum() == 2
+
+
+def test_what_was_taken_in_can_be_written_and_read(tmp_path):
+    raw = ingest(frame(), channels(), feeder())
+    write_raw(tmp_path / "mine", raw)
+    back = read_raw(tmp_path / "mine")
+    pd.testing.assert_frame_equal(back.telemetry, raw.telemetry)
+    assert back.truth is None
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (frame().drop(columns="value"), r"column 'value' is missing; .*received channel, time_utc"),
+        (frame().iloc[:0], "no rows; expected at least one sample"),
+        (frame(value=list("abcdef")), r"must be numeric, received object.*to_numeric"),
+        (frame(value=[True] * 6), "must be numeric, received bool"),
+        (
+            frame(time_utc=frame().time_utc.dt.tz_localize(None)),
+            r"no time zone \(first: 2016-06-09 08:00:00\).*timezone='UTC'",
+        ),
+        (frame(time_utc=range(6)), r"'time_utc' must hold times, received int64.*to_datetime"),
+        (frame(time_utc=[pd.NaT] + [T] * 5), "time_utc is empty in 1 rows"),
+        (frame(channel=["U7"] * 6), "channel 'U7' is not in the channels table .*mean 'U6'"),
+        (frame(quality=["good"] * 6), "'quality' must hold whole numbers"),
+    ],
+)
+def test_a_broken_table_is_refused_with_its_remedy(own, message):
+    with pytest.raises(TableError, match=message):
+        ingest(own, channels(), feeder())
+
+
+def test_an_hour_that_occurs_twice_needs_utc():
+    times = pd.to_datetime(["2016-10-30 02:30"] * 6)
+    with pytest.raises(TableError, match="summer time only the source's UTC offset tells"):
+        ingest(frame(time_utc=times), channels(), feeder(), timezone="Europe/Berlin")
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        (("element", "bus/66"), "has no bus '66'"),
+        (("unit", "MW"), "does not fit vm_pu"),
+        (("sigma", -1.0), "must be a standard deviation above 0"),
+    ],
+)
+def test_broken_channels_are_refused(cell, message):
+    broken = channels()
+    broken.loc[0, cell[0]] = cell[1]
+    with pytest.raises(TableError, match=message):
+        ingest(frame(), broken, feeder())
+
+
+def test_bus_results_of_another_tool_with_their_shunts_are_refused():
+    network = library.load("ieee30")
+    flow = power_flow.solve(network)
+    bus = int(np.flatnonzero(network.buses.b_shunt_pu)[-1])
+    name = network.buses.name[bus]
+    shunt = network.buses.b_shunt_pu[bus] * flow.vm[bus] ** 2
+    about = pd.DataFrame(
+        {
+            "channel": ["v", "p", "q"],
+            "source": "scada",
+            "quantity": ["vm_pu", "p_mw", "q_mvar"],
+            "element": f"bus/{name}",
+            "unit": ["pu", "MW", "MVar"],
+            "sigma": 0.01,
+            "sigma_kind": "absolute",
+            "period_s": 60.0,
+            "sign": [1, -1, -1],
+        }
+    )
+    p, q = flow.p_pu[bus] * network.base_mva, flow.q_pu[bus] * network.base_mva
+    copied = pd.DataFrame(
+        {
+            "channel": ["v", "p", "q"],
+            "time_utc": [T, T, T],
+            "value": [flow.vm[bus], -p, -(q + shunt * network.base_mva)],
+        }
+    )
+    with pytest.raises(TableError, match=rf"q_mvar at bus/{name} .* plus the bus's own shunt"):
+        ingest(copied, about, network)
+    assert len(ingest(copied, about, network, shunts="accept").telemetry) == 3
+    right = copied.assign(value=[flow.vm[bus], -p, -q])
+    assert len(ingest(right, about, network).telemetry) == 3
