@@ -80,17 +80,28 @@ def build(
             process.learn_load(history, layout, network, study.step_s, source=method.source_sigma),
         )
     )
-    # Samples that average an interval arrive with a delay; a multiple of the step is kept for it.
-    averaged = history.fresh & (layout.window_s > 0)
-    delay = float(np.quantile(history.age_s[averaged], 0.95)) if averaged.any() else 0.0
     return kalman_filter(
         method.name,
         network,
         layout,
         noise,
         step_s=study.step_s,
-        delay_s=max(delay, study.step_s if (layout.window_s > 0).any() else 0.0),
+        reach_s=_reach(history, layout, study.step_s),
     )
+
+
+def _reach(history: Record, layout: SensorLayout, step_s: float) -> float:
+    """How far fresh samples usually reach back; the few that come later are not worth the states.
+
+    Without history a sample is expected within one step of its end.
+    """
+    span = history.age_s + layout.window_s
+    usual = [
+        np.quantile(span[history.fresh[:, row], row], 0.95)
+        for row in np.flatnonzero(history.fresh.any(axis=0))
+    ]
+    expected = float(np.max(layout.window_s, initial=0.0)) + step_s
+    return float(max(usual)) if usual else expected
 
 
 def estimate(

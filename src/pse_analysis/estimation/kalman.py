@@ -3,8 +3,7 @@
 A sample is rarely taken at the instant it is used at: a meter reports the mean of the last quarter
 of an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last K
 instants beside the present one, and reads a sample through the weights with which its interval
-covers them, by linear interpolation between instants. What interpolation leaves out, the movement
-inside a step, is added to the sample's variance. So a sample enters once, where it belongs.
+covers them (`pse_analysis.estimation.intervals`). So a sample enters once, where it belongs.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy.typing as npt
 from scipy import linalg
 
 from pse_analysis.errors import Unobservable
+from pse_analysis.estimation import intervals
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
 from pse_analysis.estimation.wls import WeightedLeastSquares
@@ -59,15 +59,17 @@ def predict(state: KalmanState, noise: FloatArray) -> KalmanState:
 
 
 def update(
-    state: KalmanState, H: FloatArray, z: FloatArray, variance: FloatArray
+    state: KalmanState, H: FloatArray, z: FloatArray, R: FloatArray
 ) -> tuple[KalmanState, FloatArray, FloatArray, float]:
-    """Condition on z = H x + v with independent v.
+    """Condition on z = H x + v.
 
     Parameters
     ----------
     state : KalmanState
     H : (m, n) ndarray
-    z, variance : (m,) ndarray
+    z : (m,) ndarray
+    R : (m, m) ndarray
+        Covariance of v.
 
     Returns
     -------
@@ -86,8 +88,7 @@ def update(
     """
     innovation = z - H @ state.x
     HP = H @ state.P
-    S = HP @ H.T
-    S[np.diag_indices_from(S)] += variance
+    S = HP @ H.T + R
     chol_S = linalg.cholesky(S, lower=True, check_finite=False)
     white = linalg.solve_triangular(chol_S, innovation, lower=True, check_finite=False)
     # P - K S Kᵀ = P - WᵀW with W = chol(S)⁻¹ H P: one symmetric product.
@@ -100,57 +101,6 @@ def update(
     )
 
 
-def interval_weights(
-    age_s: FloatArray, window_s: FloatArray, step_s: float, lags: int
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """How samples that end ``age_s`` ago and average ``window_s`` read the last states.
-
-    Parameters
-    ----------
-    age_s, window_s : (m,) ndarray
-        [s]
-    step_s : float
-        [s]
-    lags : int
-        K, the oldest state kept.
-
-    Returns
-    -------
-    weights : (m, K+1) ndarray
-        Of the present, one step ago, …; rows sum to 1.
-    inside : (m,) ndarray
-        Variance of what linear interpolation leaves out, as a multiple of the variance of one step
-        of a random walk: u(1-u) for an instant a fraction u into a step, and 1/12 of a step's share
-        squared for a mean over it.
-    covered : (m,) ndarray of bool
-        Whether the interval lies inside the last K steps; the other rows mean nothing.
-    """
-    near, width = np.asarray(age_s) / step_s, np.asarray(window_s) / step_s
-    far = near + width
-    covered = far <= lags + 1e-9
-    lag = np.arange(lags + 1)
-    instant = width < 1e-9
-    hat = np.maximum(0.0, 1.0 - np.abs(near[:, None] - lag))
-    safe = np.where(instant, 1.0, width)[:, None]
-    mean = (_hat_integral(far[:, None] - lag) - _hat_integral(near[:, None] - lag)) / safe
-    weights = np.where(instant[:, None], hat, mean)
-    fraction = near - np.floor(near)
-    step = np.arange(max(lags, 1))
-    begin = np.clip(near[:, None] - step, 0.0, 1.0)
-    end = np.clip(far[:, None] - step, 0.0, 1.0)
-    span = end - begin
-    # ∫∫ [min(u, v) - uv] du dv over the part of a step that the window covers: a Brownian bridge.
-    bridge = begin * span**2 + span**3 / 3.0 - 0.25 * (end**2 - begin**2) ** 2
-    inside = np.where(instant, fraction * (1.0 - fraction), bridge.sum(axis=1) / safe[:, 0] ** 2)
-    return weights, inside, covered
-
-
-def _hat_integral(u: FloatArray) -> FloatArray:
-    """∫ max(0, 1-|v|) dv from -∞ to u."""
-    u = np.clip(u, -1.0, 1.0)
-    return np.where(u < 0, 0.5 * (1 + u) ** 2, 1.0 - 0.5 * (1 - u) ** 2)
-
-
 def kalman_filter(
     name: str,
     network: Network,
@@ -158,7 +108,7 @@ def kalman_filter(
     noise: ProcessNoise,
     *,
     step_s: float,
-    delay_s: float = 0.0,
+    reach_s: float = 0.0,
 ) -> Estimator:
     """Kalman filter with F = I on the linear rectangular model.
 
@@ -172,9 +122,9 @@ def kalman_filter(
         Q of the step to an instant.
     step_s : float
         Step between instants. [s]
-    delay_s : float
-        Largest age at which a sample that averages an interval arrives; with the longest interval
-        it sets how many past states are kept. [s]
+    reach_s : float
+        How far samples reach back from the instant at which they are used, age and interval
+        together; it sets how many past states are kept, and older samples are passed over. [s]
 
     Returns
     -------
@@ -189,8 +139,7 @@ def kalman_filter(
     model = RectangularModel(network, layout)
     wls = WeightedLeastSquares(network, layout)
     n2 = 2 * network.n_bus
-    reach = float(np.max(layout.window_s, initial=0.0)) + delay_s
-    lags = int(np.ceil(reach / step_s - 1e-9))
+    lags = int(np.ceil(reach_s / step_s - 1e-9))
     # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
     held = None if layout.has_angle else network.n_bus + network.slack
 
@@ -236,21 +185,23 @@ def kalman_filter(
         before = _voltage(state.x, network.n_bus)
         walk = process(before, snapshot.time)
         prior = predict(state, walk)
-        weights, inside, covered = interval_weights(snapshot.age_s, layout.window_s, step_s, lags)
-        used = snapshot.available & snapshot.fresh & covered
+        age, window = snapshot.age_s, layout.window_s
+        used = snapshot.available & snapshot.fresh & intervals.covered(age, window, step_s, lags)
         if not used.any():
             return prior, Info.nothing(m, Status.PREDICTED)
         rows = np.flatnonzero(used)
+        share = intervals.weights(age[rows], window[rows], step_s, lags)
+        bridge = intervals.bridge_covariance(age[rows], window[rows], step_s, lags)
         sigma = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
         at = before
         for passes in range(1, MAX_PASSES + 1):  # noqa: B007 (reported after the loop)
             H, z, spread = model.rows(snapshot.z, sigma, used, at)
             H, z, spread = H[rows].toarray(), z[rows], spread[rows]
-            moved = np.einsum("ij,ij->i", H @ walk, H)
-            variance = spread**2 + inside[rows] * moved
-            lagged = (weights[rows][:, :, None] * H[:, None, :]).reshape(len(rows), -1)
+            R = bridge * (H @ walk @ H.T)
+            R[np.diag_indices_from(R)] += spread**2
+            lagged = (share[:, :, None] * H[:, None, :]).reshape(len(rows), -1)
             try:
-                posterior, innovation, deviation, nis = update(prior, lagged, z, variance)
+                posterior, innovation, deviation, nis = update(prior, lagged, z, R)
             except np.linalg.LinAlgError:
                 return None, Info.nothing(
                     m,
