@@ -152,7 +152,7 @@ class Network:
     ------
     GridError
         On repeated names, an end bus that does not exist, a zero series impedance, a value that is
-        not finite, or anything but one slack bus.
+        not finite, a ratio or rated voltage that is not positive, or anything but one slack bus.
     """
 
     name: str
@@ -195,6 +195,20 @@ class Network:
                         f"{self.name}: {table}.{field.name} must be finite, "
                         f"{culprit!r} has {values[~np.isfinite(values)][0]}"
                     )
+        for columns, field, good, wanted in (
+            (branch, "tap", branch.tap > 0, "positive: 1 where there is no transformer"),
+            (bus, "vn_kv", bus.vn_kv > 0, "positive"),
+            (bus, "kind", np.isin(bus.kind, list(BusKind)), "1, 2 or 3: PQ, PV or slack"),
+            (bus, "q_min_mvar", ~np.isnan(bus.q_min_mvar), "a number: -inf where none is known"),
+            (bus, "q_max_mvar", ~np.isnan(bus.q_max_mvar), "a number: inf where none is known"),
+        ):
+            if not good.all():
+                culprit = int(np.argmin(good))
+                kind = "branch" if columns is branch else "bus"
+                raise GridError(
+                    f"{self.name}: {field} of {kind} {columns.name[culprit]!r} must be {wanted}; "
+                    f"received {getattr(columns, field)[culprit]}"
+                )
         slacks = int((bus.kind == BusKind.SLACK).sum())
         if slacks != 1:
             raise GridError(f"{self.name}: expected one slack bus, received {slacks}")
