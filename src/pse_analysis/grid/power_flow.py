@@ -140,6 +140,12 @@ def solve(
         pending = _switch(network, x, q, vm_set, held, limit)
         if not len(pending):
             break
+    else:
+        raise NotConverged(
+            f"power flow of {network.name}: the set of buses at a reactive limit still changed "
+            f"after {network.n_bus + 1} passes in {len(pending)} of {p.shape[1]} states: widen the "
+            "limits or solve without them"
+        )
     solved_p, solved_q = _injections(network, x)
     shape = (network.n_bus, points) if points else (network.n_bus,)
     return PowerFlow(
