@@ -1,0 +1,191 @@
+"""Claim: a network is immutable, names its elements, and refuses what it cannot mean."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reference import GRIDS
+
+from pse_analysis.errors import GridError
+from pse_analysis.grid import BusKind, library
+from pse_analysis.grid.network import Network
+
+
+def changed(network: Network, table: str, **columns: object) -> Network:
+    """The network with columns of a table replaced."""
+    part = dataclasses.replace(getattr(network, table), **columns)
+    return dataclasses.replace(network, **{table: part})
+
+
+@pytest.mark.parametrize(
+    ("grid", "buses", "branches", "closed"),
+    [
+        ("ieee14", 14, 20, 20),
+        ("ieee30", 30, 41, 41),
+        ("ieee33", 33, 37, 32),
+        ("ieee118", 118, 186, 186),
+    ],
+)
+def test_library_has_the_literatures_counts(
+    grid: str, buses: int, branches: int, closed: int
+) -> None:
+    network = library.load(grid)
+    assert (network.n_bus, network.n_branch) == (buses, branches)
+    assert int(network.branches.in_service.sum()) == closed
+    assert network.buses.name == tuple(str(i + 1) for i in range(buses))
+
+
+def test_feeder_carries_baran_and_wus_load() -> None:
+    buses = library.load("ieee33").buses
+    assert buses.p_load_mw.sum() == pytest.approx(3.715)
+    assert buses.q_load_mvar.sum() == pytest.approx(2.3)
+
+
+def test_parallel_circuits_have_names_of_their_own() -> None:
+    names = library.load("ieee118").branches.name
+    assert {"42-49", "42-49#2", "49-54", "49-54#2"} <= set(names)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_tables_give_the_same_network_back(grid: str) -> None:
+    network = library.load(grid)
+    again = Network.from_tables(**network.to_tables())
+    for table in ("buses", "branches"):
+        for column in dataclasses.fields(getattr(network, table)):
+            np.testing.assert_array_equal(
+                getattr(getattr(again, table), column.name),
+                getattr(getattr(network, table), column.name),
+            )
+    assert (again.name, again.base_mva) == (network.name, network.base_mva)
+
+
+def test_columns_cannot_be_written_to() -> None:
+    network = library.load("ieee14")
+    with pytest.raises(ValueError, match="read-only"):
+        network.branches.in_service[0] = False
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        network.base_mva = 1.0  # type: ignore[misc]
+
+
+def test_caller_keeps_the_array_it_handed_in() -> None:
+    network = library.load("ieee14")
+    ratio = network.branches.tap.copy()
+    other = changed(network, "branches", tap=ratio)
+    ratio[0] = 3.0
+    assert other.branches.tap[0] == network.branches.tap[0]
+
+
+def test_opening_a_branch_returns_another_network() -> None:
+    network = library.load("ieee14")
+    opened = network.open_branch("1-2")
+    k = network.branch("1-2")
+    assert network.branches.in_service[k]
+    assert not opened.branches.in_service[k]
+    assert abs(opened.y_from[[k]]).sum() == abs(opened.y_to[[k]]).sum() == 0
+    series = 1 / (network.branches.r_pu[k] + 1j * network.branches.x_pu[k])
+    f, t = network.bus("1"), network.bus("2")
+    assert (opened.y_bus - network.y_bus)[f, t] == pytest.approx(series)
+
+
+def test_opening_the_only_path_makes_an_island() -> None:
+    island = library.load("ieee33").open_branch("6-7").islands()
+    names = np.array(library.load("ieee33").buses.name)
+    assert set(names[island != island[0]]) == {str(i) for i in range(7, 19)}
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_current_of_equal_voltages_is_that_of_shunts_and_taps_alone(grid: str) -> None:
+    network = library.load(grid)
+    plain = changed(
+        network,
+        "branches",
+        tap=np.ones(network.n_branch),
+        shift_rad=np.zeros(network.n_branch),
+        b_pu=np.zeros(network.n_branch),
+        g_pu=np.zeros(network.n_branch),
+    )
+    shunt = network.buses.g_shunt_pu + 1j * network.buses.b_shunt_pu
+    np.testing.assert_allclose(plain.y_bus @ np.ones(network.n_bus), shunt, atol=1e-9)
+
+
+def test_base_current_is_base_power_over_rated_voltage() -> None:
+    network = library.load("ieee33")
+    assert network.base_ka[4] == pytest.approx(network.base_mva / (np.sqrt(3) * 12.66))
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "expected"),
+    [
+        ("bus", "331", "did you mean 33"),
+        ("branch", "1-3", "did you mean"),
+        ("bus", "x", "it has 33"),
+    ],
+)
+def test_unknown_element_names_what_is_close(call: str, name: str, expected: str) -> None:
+    with pytest.raises(GridError, match=expected) as caught:
+        getattr(library.load("ieee33"), call)(name)
+    assert repr(name) in str(caught.value)
+
+
+def test_unknown_grid_names_what_is_close() -> None:
+    with pytest.raises(GridError, match=r"did you mean 'ieee33'.*ieee14, ieee30"):
+        library.load("ieee_33")
+
+
+def spoilt(column: str, value: object, n: int = 14) -> np.ndarray:
+    out = np.full(n, 1.0)
+    out[3] = value  # type: ignore[call-overload]
+    return out
+
+
+@pytest.mark.parametrize(
+    ("table", "columns", "expected"),
+    [
+        (
+            "branches",
+            {"r_pu": np.zeros(20), "x_pu": np.zeros(20)},
+            "'1-2' has zero impedance.*merge",
+        ),
+        ("branches", {"r_pu": np.full(20, np.nan)}, "branches.r_pu must be finite, '1-2' has nan"),
+        ("branches", {"to_bus": np.full(20, 14)}, "branch ends must lie in 0…13"),
+        ("branches", {"tap": np.zeros(20)}, "tap of branch '1-2' must be positive.*1"),
+        ("branches", {"x_pu": np.ones(19)}, "expected 20 values, one per name, received shape"),
+        ("buses", {"vn_kv": spoilt("vn_kv", np.inf)}, "buses.vn_kv must be finite, '4' has inf"),
+        ("buses", {"vn_kv": spoilt("vn_kv", 0.0)}, "vn_kv of bus '4' must be positive"),
+        ("buses", {"kind": np.ones(14)}, "expected one slack bus, received 0"),
+        ("buses", {"kind": np.full(14, 3)}, "expected one slack bus, received 14"),
+        ("buses", {"kind": np.array([3, 7] + [1] * 12)}, "kind of bus '2' must be 1, 2 or 3"),
+        ("buses", {"q_max_mvar": np.full(14, np.nan)}, "q_max_mvar of bus '1'.*inf where"),
+        ("buses", {"name": ("1",) * 14}, "distinct names, '1' repeats"),
+    ],
+)
+def test_impossible_grid_is_refused(table: str, columns: dict[str, object], expected: str) -> None:
+    with pytest.raises(GridError, match=expected):
+        changed(library.load("ieee14"), table, **columns)
+
+
+def test_base_power_must_be_positive() -> None:
+    with pytest.raises(GridError, match="base_mva must be positive, received 0"):
+        dataclasses.replace(library.load("ieee14"), base_mva=0.0)
+
+
+def test_branch_to_nowhere_names_the_bus() -> None:
+    tables = library.load("ieee14").to_tables()
+    tables["branches"].loc[2, "to_bus"] = "99"
+    with pytest.raises(GridError, match="to_bus '99' is no bus"):
+        Network.from_tables(**tables)
+
+
+def test_missing_column_names_it_and_what_came() -> None:
+    tables = library.load("ieee14").to_tables()
+    tables["buses"] = tables["buses"].drop(columns="vn_kv")
+    with pytest.raises(GridError, match="'buses': column 'vn_kv' is missing; expected name, kind"):
+        Network.from_tables(**tables)
+
+
+def test_slack_is_where_its_kind_says() -> None:
+    network = library.load("ieee118")
+    assert network.buses.name[network.slack] == "69"
+    assert network.buses.kind[network.slack] == BusKind.SLACK

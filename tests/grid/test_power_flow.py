@@ -1,0 +1,169 @@
+"""Claim: power flow solves what it says it solves, many states at once, or says where it failed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import GRIDS
+
+from pse_analysis.errors import GridError, NotConverged
+from pse_analysis.grid import BusKind, library
+from pse_analysis.grid.power_flow import solve
+
+SEED = 118
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_solved_state_meets_every_given_injection_and_voltage(grid: str) -> None:
+    network = library.load(grid)
+    flow = solve(network)
+    kind = network.buses.kind
+    load, source = kind == BusKind.PQ, kind == BusKind.SLACK
+    np.testing.assert_allclose(flow.p_pu[~source], network.p_nominal_pu[~source], atol=1e-10)
+    np.testing.assert_allclose(flow.q_pu[load], network.q_nominal_pu[load], atol=1e-10)
+    np.testing.assert_array_equal(flow.vm[~load], network.buses.vm_set_pu[~load])
+    assert flow.theta[network.slack] == 0.0
+    assert flow.iterations <= 6
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_many_states_equal_one_at_a_time(grid: str) -> None:
+    network = library.load(grid)
+    rng = np.random.default_rng(SEED)
+    scale = rng.uniform(0.5, 1.1, (network.n_bus, 70))
+    p, q = network.p_nominal_pu[:, None] * scale, network.q_nominal_pu[:, None] * scale
+    vm = network.buses.vm_set_pu[:, None] + rng.uniform(-0.01, 0.01, (network.n_bus, 70))
+    together = solve(network, p, q, vm)
+    for k in (0, 33, 63, 64, 69):
+        alone = solve(network, p[:, k], q[:, k], vm[:, k])
+        np.testing.assert_allclose(together.x[:, k], alone.x, atol=1e-9)
+        np.testing.assert_allclose(together.q_pu[:, k], alone.q_pu, atol=1e-8)
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(factor=st.floats(0.05, 1.4), volt=st.floats(0.97, 1.05))
+def test_power_that_enters_a_feeder_is_load_and_loss(factor: float, volt: float) -> None:
+    network = library.load("ieee33")
+    flow = solve(
+        network,
+        factor * network.p_nominal_pu,
+        factor * network.q_nominal_pu,
+        np.full(network.n_bus, volt),
+    )
+    voltage = flow.vm * np.exp(1j * flow.theta)
+    b = network.branches
+    closed = b.in_service
+    drop = voltage[b.from_bus[closed]] - voltage[b.to_bus[closed]]
+    loss = np.abs(drop) ** 2 * (1 / (b.r_pu[closed] + 1j * b.x_pu[closed])).real
+    assert flow.p_pu.sum() == pytest.approx(loss.sum(), abs=1e-9)
+    assert loss.sum() > 0
+
+
+def test_a_day_of_the_feeder_takes_less_than_two_seconds() -> None:
+    import time
+
+    network = library.load("ieee33")
+    scale = np.random.default_rng(SEED).uniform(0.2, 1.2, (network.n_bus, 288))
+    begun = time.perf_counter()
+    solve(network, network.p_nominal_pu[:, None] * scale, network.q_nominal_pu[:, None] * scale)
+    assert time.perf_counter() - begun < 2.0
+
+
+def test_start_at_the_solution_takes_no_iteration() -> None:
+    network = library.load("ieee118")
+    flow = solve(network)
+    assert solve(network, start=flow.x).iterations == 0
+
+
+def test_overload_names_state_bus_and_mismatch() -> None:
+    network = library.load("ieee33")
+    scale = np.array([1.0, 8.0, 0.5])
+    with pytest.raises(NotConverged) as caught:
+        solve(network, network.p_nominal_pu[:, None] * scale, network.q_nominal_pu[:, None] * scale)
+    message = str(caught.value)
+    assert "power flow of ieee33 did not converge in" in message
+    assert "1 of 3 states" in message
+    assert "(state 1)" in message
+    assert "p.u. at bus '" in message
+    assert "lower the load" in message
+
+
+def test_states_that_would_converge_are_not_counted_among_the_open() -> None:
+    network = library.load("ieee33")
+    scale = np.array([1.0, 400.0, 0.5])
+    with pytest.raises(NotConverged, match="1 of 3 states are open"):
+        solve(network, network.p_nominal_pu[:, None] * scale, network.q_nominal_pu[:, None] * scale)
+
+
+def test_part_without_a_source_names_its_buses() -> None:
+    network = library.load("ieee33").open_branch("17-18").open_branch("24-25")
+    with pytest.raises(GridError, match=r"2 buses have no path to the slack bus \(18, 25\)"):
+        solve(network)
+
+
+def test_injection_that_is_not_finite_names_its_bus() -> None:
+    network = library.load("ieee14")
+    p = network.p_nominal_pu.copy()
+    p[4] = np.nan
+    with pytest.raises(GridError, match="p_pu must be finite, received nan at bus '5', state 0"):
+        solve(network, p)
+
+
+def test_open_branch_carries_nothing() -> None:
+    network = library.load("ieee14").open_branch("2-4")
+    flow = solve(network)
+    voltage = flow.vm * np.exp(1j * flow.theta)
+    assert (network.y_from @ voltage)[network.branch("2-4")] == 0
+    assert np.abs(flow.theta - solve(library.load("ieee14")).theta).max() > 1e-3
+
+
+def test_reactive_limit_is_kept_and_its_bus_gives_up_its_voltage() -> None:
+    network = library.load("ieee118")
+    free, kept = solve(network), solve(network, enforce_q_limits=True)
+    generation = (kept.q_pu - network.q_nominal_pu) * network.base_mva
+    pv = network.buses.kind == BusKind.PV
+    before = (free.q_pu - network.q_nominal_pu) * network.base_mva
+    assert (before[pv] > network.buses.q_max_mvar[pv] + 1e-6).any()
+    assert (generation[pv] <= network.buses.q_max_mvar[pv] + 1e-6).all()
+    assert (generation[pv] >= network.buses.q_min_mvar[pv] - 1e-6).all()
+    assert kept.limited.any()
+    held = pv & ~kept.limited
+    np.testing.assert_array_equal(kept.vm[held], network.buses.vm_set_pu[held])
+    moved = np.abs(kept.vm - network.buses.vm_set_pu)[kept.limited]
+    assert (moved > 1e-6).all()
+
+
+def test_limits_of_one_state_do_not_bind_another() -> None:
+    network = library.load("ieee118")
+    scale = np.array([1.0, 0.6])
+    load = network.q_nominal_pu[:, None] * scale
+    p = network.p_nominal_pu[:, None] * scale
+    both = solve(network, p, load, enforce_q_limits=True)
+    for k in range(2):
+        alone = solve(network, p[:, k], load[:, k], enforce_q_limits=True)
+        np.testing.assert_array_equal(both.limited[:, k], alone.limited)
+        np.testing.assert_allclose(both.vm[:, k], alone.vm, atol=1e-9)
+    assert (both.limited[:, 0] != both.limited[:, 1]).any()
+
+
+def test_base_power_changes_the_units_and_nothing_else() -> None:
+    network = library.load("ieee14")
+    factor = 37.0 / network.base_mva
+    b, bus = network.branches, network.buses
+    other = dataclasses.replace(
+        network,
+        base_mva=37.0,
+        branches=dataclasses.replace(
+            b, r_pu=b.r_pu * factor, x_pu=b.x_pu * factor, b_pu=b.b_pu / factor
+        ),
+        buses=dataclasses.replace(
+            bus, g_shunt_pu=bus.g_shunt_pu / factor, b_shunt_pu=bus.b_shunt_pu / factor
+        ),
+    )
+    flow, same = solve(network), solve(other)
+    np.testing.assert_allclose(same.x, flow.x, atol=1e-10)
+    np.testing.assert_allclose(same.p_pu * 37.0, flow.p_pu * network.base_mva, atol=1e-7)
