@@ -66,7 +66,7 @@ def study_tables(n_instant: int = 288, n_trial: int = 2) -> StudyTables:
     samples = _samples(channels, history, vm, network, rng)
     validated = check("validated", samples.drop(columns=["true"]))
     sample_truth = samples[["trial", "channel", "seq", "time_utc", "true"]]
-    found = samples[samples.reasons == int(Reason.LIMIT)]
+    found = samples[(samples.reasons & int(Reason.LIMIT)) > 0]
     faults = found[["trial", "channel", "seq", "time_utc"]].assign(kind="spike", size=0.2)
     faults["seq"] = faults.seq.astype("Int64")
 
@@ -196,7 +196,7 @@ def _samples(channels, times, vm, network, rng) -> pd.DataFrame:
             spikes = rng.choice(n_instant, 3, replace=False) + 10 if number % 2 == 0 else []
             value[spikes] += 0.2
             reasons[spikes] = int(Reason.LIMIT)
-            reasons[100:112] = int(Reason.STUCK) if number % 5 == 0 else 0
+            reasons[100:112] |= int(Reason.STUCK) if number % 5 == 0 else 0
             if number == 3:
                 value[50], reasons[50] = np.nan, int(Reason.NOT_FINITE)
             rows.append(
