@@ -9,7 +9,7 @@ only the latter can be calibrated.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -205,64 +205,147 @@ def learn_load(
 
     Notes
     -----
-    Increments of a random walk with variance rate r, sampled every T as means over W, have
-    variance r (T - W/3); twice the meter's own variance is taken off first. The correlation is
+    A load with variance rate r changes by r T between samples T apart. Means over T hide a part of
+    that, and the more the faster the load reverts; but if its changes d between the ends of the
+    intervals have autocovariances c₀, c₁, 0, …, and it moves as a Brownian bridge in between, then
+    E(m₊ - 2m + m₋)² = c₀ whatever c₁ is. So means enter by their second difference, instantaneous
+    samples by the first; 6σ² or 2σ² of the meter itself are taken off. The correlation is
     shrunk towards the identity by the intensity that Schäfer and Strimmer (2005) derive from its
-    sampling variance.
+    sampling variance. The variances are then scaled so that every day's changes have a mean NIS of
+    1 under what the other days teach.
     """
     n = network.n_bus
     slots = round(DAY_S / slot_s)
-    rows = np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS))
+    meters = _meters(history, layout, n)
     deviation = np.full((slots, 2 * n), np.nan)
-    standard, where = [], []
-    for row in rows:
-        use = np.flatnonzero(history.fresh[:, row])
-        place = layout.position[row] + (n if layout.quantity[row] == Q else 0)
-        if len(use) < 12 or not np.isnan(deviation[0, place]):
-            continue
-        change = np.diff(history.z[use, row])
-        elapsed = np.diff(history.time[use]) / np.timedelta64(1, "s")
-        change, elapsed, use = change[elapsed > 0], elapsed[elapsed > 0], use[1:][elapsed > 0]
-        usual = np.median(elapsed)
-        regular = elapsed < 1.5 * usual
-        sigma = standard_deviation(history.z[use, row], layout.sigma[row], layout.relative[row])
-        meter = 2.0 * float(np.mean(sigma**2))
-        of_day = _second_of_day(history.time[use])
-        square = _by_slot(change[regular] ** 2, of_day[regular], slots, slot_s, bandwidth_s)
-        moving = np.maximum(square - meter, 0.1 * square)
-        rate = moving / (usual - layout.window_s[row] / 3.0)
-        deviation[:, place] = np.sqrt(rate * step_s)
-        panel = np.full(len(history.time), np.nan)
-        slot = (of_day // slot_s).astype(int) % slots
-        panel[use[regular]] = change[regular] / np.sqrt(square[slot[regular]])
-        standard.append(panel)
-        where.append(place)
     correlation = np.eye(2 * n)
-    if where:
-        index = np.ix_(where, where)
-        correlation[index] = _shrunk_correlation(np.array(standard).T)
+    if len(meters.place):
+        square, within = _fit(meters, slots, slot_s, bandwidth_s)
+        square = square * _held_out_ratio(meters, slots, slot_s, bandwidth_s)
+        moving = np.maximum(square - meters.noise, 0.1 * square)
+        deviation[:, meters.place] = np.sqrt(moving / meters.span_s * step_s)
+        correlation[np.ix_(meters.place, meters.place)] = within
     _fill_unmetered(deviation, network)
     if source is None:
         source = learn_source(history, layout, network)
     return LoadStatistics(deviation, correlation, source, slot_s)
 
 
-def _second_of_day(time: npt.NDArray[np.datetime64]) -> FloatArray:
-    return np.asarray((time - time.astype("datetime64[D]")) / np.timedelta64(1, "s"))
+@dataclass(frozen=True, eq=False)
+class _Meters:
+    """Increments of the metered injections.
+
+    Attributes
+    ----------
+    place : (k,) ndarray
+        Position in [P; Q].
+    change : (T, k) ndarray
+        First difference of instantaneous samples, second difference of means; NaN where there is
+        none. [p.u.]
+    second, day : (T,) ndarray
+        Second of the day, and day.
+    noise : (k,) ndarray
+        Variance that the meter itself adds to a change. [p.u.²]
+    span_s : (k,) ndarray
+        Time over which a random walk would have the variance of the change. [s]
+    """
+
+    place: npt.NDArray[np.int64]
+    change: FloatArray
+    second: FloatArray
+    day: npt.NDArray[np.int64]
+    noise: FloatArray
+    span_s: FloatArray
+
+    def only(self, rows: npt.NDArray[np.bool_]) -> _Meters:
+        """Some of the rows."""
+        return replace(self, change=self.change[rows], second=self.second[rows], day=self.day[rows])
 
 
-def _by_slot(
-    square: FloatArray, of_day: FloatArray, slots: int, slot_s: float, bandwidth_s: float
-) -> FloatArray:
-    """Mean square by slot of the day, smoothed around the clock, shrunk to the day's mean."""
+def _meters(history: Record, layout: SensorLayout, n_bus: int) -> _Meters:
+    place, change, noise, span = [], [], [], []
+    for row in np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS)):
+        use = np.flatnonzero(history.fresh[:, row])
+        where = int(layout.position[row]) + (n_bus if layout.quantity[row] == Q else 0)
+        if len(use) < 12 or where in place:
+            continue
+        elapsed = np.diff(history.time[use]) / np.timedelta64(1, "s")
+        usual = float(np.median(elapsed))
+        regular = elapsed < 1.5 * usual
+        # Means of adjoining intervals share a move, which their second difference undoes.
+        means = layout.window_s[row] > 0.5 * usual
+        if means:
+            difference = np.diff(history.z[use, row], n=2)
+            regular, use = regular[1:] & regular[:-1], use[2:]
+        else:
+            difference, use = np.diff(history.z[use, row]), use[1:]
+        column = np.full(len(history.time), np.nan)
+        column[use[regular]] = difference[regular]
+        known = history.fresh[:, row]
+        sigma = standard_deviation(history.z[known, row], layout.sigma[row], layout.relative[row])
+        place.append(where)
+        change.append(column)
+        noise.append((6.0 if means else 2.0) * float(np.mean(sigma**2)))
+        span.append(usual)
+    panel = np.array(change).reshape(len(place), len(history.time)).T
+    rows = np.isfinite(panel).any(axis=1)
+    time = history.time[rows]
+    return _Meters(
+        np.array(place, dtype=np.int64),
+        panel[rows],
+        np.asarray((time - time.astype("datetime64[D]")) / np.timedelta64(1, "s")),
+        time.astype("datetime64[D]").astype(np.int64),
+        np.array(noise),
+        np.array(span),
+    )
+
+
+def _fit(
+    meters: _Meters, slots: int, slot_s: float, bandwidth_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Mean square by slot of the day, (slots, k), and correlation, (k, k), of the changes.
+
+    The mean square is smoothed around the clock and shrunk to that of the whole day by the number
+    of samples it rests on.
+    """
     centre = (np.arange(slots) + 0.5) * slot_s
-    apart = np.abs(centre[:, None] - of_day[None, :])
+    apart = np.abs(centre[:, None] - meters.second)
     apart = np.minimum(apart, DAY_S - apart)
     weight = np.exp(-0.5 * (apart / bandwidth_s) ** 2)
-    local = weight @ square / weight.sum(axis=1)
-    effective = weight.sum(axis=1) ** 2 / (weight**2).sum(axis=1)
+    known = np.isfinite(meters.change).astype(float)
+    squared = np.where(known > 0, meters.change, 0.0) ** 2
+    mass = np.maximum(weight @ known, 1e-12)
+    effective = mass**2 / np.maximum(weight**2 @ known, 1e-12)
     trust = effective / (effective + 5.0)
-    return np.asarray(np.maximum(trust * local + (1 - trust) * square.mean(), 1e-16))
+    whole = squared.sum(axis=0) / known.sum(axis=0)
+    square = np.maximum(trust * (weight @ squared) / mass + (1 - trust) * whole, 1e-16)
+    return square, _shrunk_correlation(
+        meters.change / np.sqrt(square[_slot(meters, slots, slot_s)])
+    )
+
+
+def _slot(meters: _Meters, slots: int, slot_s: float) -> npt.NDArray[np.int64]:
+    return np.asarray((meters.second // slot_s).astype(np.int64) % slots)
+
+
+def _held_out_ratio(meters: _Meters, slots: int, slot_s: float, bandwidth_s: float) -> float:
+    """Mean NIS per meter of each day's changes under what the other days teach.
+
+    Variances and correlations learnt from a few days are too sure of themselves; this is by how
+    much. 1 where there are fewer than three days to hold out.
+    """
+    days = np.unique(meters.day)
+    if len(days) < 3:
+        return 1.0
+    total = count = 0.0
+    for day in days:
+        apart = meters.only(meters.day == day)
+        square, correlation = _fit(meters.only(meters.day != day), slots, slot_s, bandwidth_s)
+        white = apart.change / np.sqrt(square[_slot(apart, slots, slot_s)])
+        white = white[np.isfinite(white).all(axis=1)]
+        total += float(np.sum(white.T * np.linalg.solve(correlation, white.T)))
+        count += white.size
+    return total / count if count else 1.0
 
 
 def _shrunk_correlation(panel: FloatArray) -> FloatArray:
