@@ -195,7 +195,7 @@ class Network:
                         f"{self.name}: {table}.{field.name} must be finite, "
                         f"{culprit!r} has {values[~np.isfinite(values)][0]}"
                     )
-        for columns, field, good, wanted in (
+        for of, column, good, wanted in (
             (branch, "tap", branch.tap > 0, "positive: 1 where there is no transformer"),
             (bus, "vn_kv", bus.vn_kv > 0, "positive"),
             (bus, "kind", np.isin(bus.kind, list(BusKind)), "1, 2 or 3: PQ, PV or slack"),
@@ -203,11 +203,10 @@ class Network:
             (bus, "q_max_mvar", ~np.isnan(bus.q_max_mvar), "a number: inf where none is known"),
         ):
             if not good.all():
-                culprit = int(np.argmin(good))
-                kind = "branch" if columns is branch else "bus"
+                at = int(np.argmin(good))
                 raise GridError(
-                    f"{self.name}: {field} of {kind} {columns.name[culprit]!r} must be {wanted}; "
-                    f"received {getattr(columns, field)[culprit]}"
+                    f"{self.name}: {column} of {'branch' if of is branch else 'bus'} "
+                    f"{of.name[at]!r} must be {wanted}; received {getattr(of, column)[at]}"
                 )
         slacks = int((bus.kind == BusKind.SLACK).sum())
         if slacks != 1:
