@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -49,10 +50,11 @@ class Study:
             raise ParameterError(
                 f"[study] end must lie after start, received {self.start} … {self.end}"
             )
-        if self.step_s <= 0 or self.history_s < 0:
+        # Time stamps count microseconds; negated, so that NaN is refused too.
+        if not (1e-6 <= self.step_s < math.inf and 0 <= self.history_s < math.inf):
             raise ParameterError(
-                "[study] needs step_s > 0 and history_s ≥ 0, received "
-                f"step_s = {self.step_s}, history_s = {self.history_s}"
+                "[study] needs finite step_s > 0 (a microsecond at least) and history_s ≥ 0, "
+                f"received step_s = {self.step_s}, history_s = {self.history_s}"
             )
 
     @property
@@ -78,6 +80,8 @@ def build(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     ParameterError
         On an unknown or missing key or a value of another type; the message names the remedy.
     """
+    if not isinstance(data, Mapping):
+        raise _wrong(where, cls, data)
     hints = typing.get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in data:
@@ -102,9 +106,12 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if hint is Any:
         return value
     if origin in (typing.Union, types.UnionType):
-        for option in arguments:
-            if option is type(None) and value is None:
-                return None
+        if value is None and type(None) in arguments:
+            return None
+        options = [option for option in arguments if option is not type(None)]
+        if len(options) == 1:  # its own message says more than that of the union
+            return _convert(options[0], value, where)
+        for option in options:
             try:
                 return _convert(option, value, where)
             except ParameterError:
@@ -126,7 +133,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple(_convert(arguments[0], v, f"{where}[{i}]") for i, v in enumerate(value))
         if len(arguments) != len(value):
-            raise _wrong(where, hint, value)
+            raise _wrong(where, hint, value, f"a list of {len(arguments)}")
         return tuple(
             _convert(a, v, f"{where}[{i}]")
             for i, (a, v) in enumerate(zip(arguments, value, strict=True))
@@ -138,6 +145,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return {str(k): _convert(element, v, f"{where}.{k}") for k, v in value.items()}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if hint is float and value != value:
+        raise _wrong(where, hint, value, "a number")
     if (
         isinstance(hint, type)
         and isinstance(value, hint)
@@ -147,6 +156,13 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     raise _wrong(where, hint, value)
 
 
-def _wrong(where: str, hint: Any, value: Any) -> ParameterError:
-    expected = getattr(hint, "__name__", str(hint))
-    return ParameterError(f"[{where}] expected {expected}, received {value!r}")
+def _wrong(where: str, hint: Any, value: Any, expected: str = "") -> ParameterError:
+    kind = typing.get_origin(hint) or hint
+    if not expected and isinstance(kind, type) and kind is not types.UnionType:
+        if dataclasses.is_dataclass(kind) or issubclass(kind, Mapping):
+            expected = "a table"
+        elif issubclass(kind, tuple):
+            expected = "a list"
+        else:
+            expected = kind.__name__
+    return ParameterError(f"[{where}] expected {expected or hint}, received {value!r}")
