@@ -375,7 +375,8 @@ def check(table: str, frame: pd.DataFrame) -> pd.DataFrame:
         cases = getattr(error, "failure_cases", None)
         received = ""
         if cases is not None and hasattr(cases, "iloc") and len(cases):
-            received = f"; received {cases['failure_case'].iloc[0]!r}"
+            first = cases["failure_case"].iloc[0]
+            received = f"; received {first.item() if isinstance(first, np.generic) else first!r}"
         raise TableError(
             f"{table}: column {column!r} breaks its schema: {error.check}{received}"
         ) from error
