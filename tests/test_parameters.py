@@ -1,0 +1,170 @@
+"""Claim: a table of a case file becomes a frozen dataclass, or the message says what to mend."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime, timedelta, timezone
+from typing import Any, Literal
+
+import pytest
+
+from pse_analysis.alignment import AlignParams
+from pse_analysis.errors import ParameterError, PseError
+from pse_analysis.estimation import EstimateParams, Method
+from pse_analysis.parameters import Study, build
+
+
+@dataclass(frozen=True)
+class Inner:
+    """A row of a table in a table."""
+
+    place: str
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Outer:
+    """One field of every kind that a case file may hold."""
+
+    count: int
+    share: float = 0.5
+    label: str | None = None
+    on: bool = False
+    kind: Literal["a", "b"] = "a"
+    inner: Inner | None = None
+    rows: tuple[Inner, ...] = ()
+    span: tuple[float, float] = (0.0, 1.0)
+    by_name: dict[str, float] = field(default_factory=dict)
+    anything: Any = None
+    either: int | str | None = None
+
+
+def test_all_kinds_of_fields_are_built() -> None:
+    got = build(
+        Outer,
+        {
+            "count": 3,
+            "share": 1,
+            "label": "x",
+            "on": True,
+            "kind": "b",
+            "inner": {"place": "here", "weight": 2},
+            "rows": [{"place": "p"}, {"place": "q", "weight": 0.25}],
+            "span": [1, 2.5],
+            "by_name": {"pmu": 3},
+            "anything": [1, "two"],
+            "either": "x",
+        },
+        "table",
+    )
+    assert got == Outer(
+        3, 1.0, "x", True, "b", Inner("here", 2.0), (Inner("p"), Inner("q", 0.25)), (1.0, 2.5),
+        {"pmu": 3.0}, [1, "two"], "x",
+    )  # fmt: skip
+    assert [type(v) for v in (got.share, got.span[0], got.by_name["pmu"])] == [float] * 3
+
+
+def test_keys_that_are_not_given_take_their_defaults() -> None:
+    assert build(Outer, {"count": 1}, "table") == Outer(1)
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        (
+            {"cuont": 1},
+            r"\[t\] unknown key 'cuont': did you mean 'count'\? expected any of count, s",
+        ),
+        ({"count": 1, "zzz": 1}, r"\[t\] unknown key 'zzz': expected any of"),
+        ({}, r"\[t\] key 'count' is missing: add it to the case file"),
+        ({"count": 1.5}, r"\[t.count\] expected int, received 1.5"),
+        ({"count": True}, r"\[t.count\] expected int, received True"),
+        ({"count": "1"}, r"\[t.count\] expected int, received '1'"),
+        ({"count": 1, "share": "x"}, r"\[t.share\] expected float, received 'x'"),
+        ({"count": 1, "share": True}, r"\[t.share\] expected float, received True"),
+        ({"count": 1, "share": float("nan")}, r"\[t.share\] expected a number, received nan"),
+        ({"count": 1, "on": 1}, r"\[t.on\] expected bool, received 1"),
+        ({"count": 1, "label": 4}, r"\[t.label\] expected str, received 4"),
+        ({"count": 1, "kind": "c"}, r"\[t.kind\] must be one of 'a', 'b', received 'c'"),
+        ({"count": 1, "kind": ["a"]}, r"\[t.kind\] must be one of 'a', 'b'"),
+        (
+            {"count": 1, "inner": {"plaec": "p"}},
+            r"\[t.inner\] unknown key 'plaec': did you mean 'pl",
+        ),
+        ({"count": 1, "inner": "p"}, r"\[t.inner\] expected a table, received 'p'"),
+        ({"count": 1, "rows": {"place": "p"}}, r"\[t.rows\] expected a list, received \{'place'"),
+        ({"count": 1, "rows": [{"place": "p"}, {}]}, r"\[t.rows\[1\]\] key 'place' is missing"),
+        ({"count": 1, "rows": [{"place": 7}]}, r"\[t.rows\[0\].place\] expected str, received 7"),
+        ({"count": 1, "span": [1.0]}, r"\[t.span\] expected a list of 2, received \[1.0\]"),
+        ({"count": 1, "span": [1.0, "x"]}, r"\[t.span\[1\]\] expected float, received 'x'"),
+        ({"count": 1, "by_name": {"pmu": "x"}}, r"\[t.by_name.pmu\] expected float"),
+        ({"count": 1, "either": 1.5}, r"\[t.either\] expected int \| str \| None, received 1.5"),
+        ({"count": 1, "by_name": [1]}, r"\[t.by_name\] expected a table, received \[1\]"),
+    ],
+)
+def test_message_names_the_key_what_is_allowed_and_what_came(
+    data: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ParameterError, match=expected):
+        build(Outer, data, "t")
+
+
+def test_table_must_be_a_table() -> None:
+    with pytest.raises(ParameterError, match=r"\[align\] expected a table, received 5"):
+        build(AlignParams, 5, "align")  # type: ignore[arg-type]
+
+
+def test_parameters_are_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        build(Outer, {"count": 1}, "t").count = 2  # type: ignore[misc]
+
+
+def test_method_of_a_case_file_is_built_and_a_misspelt_filter_refused() -> None:
+    data = {"methods": [{"name": "kf", "filter": "kalman", "noise": "scalar", "variance": 1}]}
+    built = build(EstimateParams, data, "estimate").methods[0]
+    assert built == Method("kf", "kalman", "scalar", 1.0)
+    data["methods"][0]["filter"] = "kallman"
+    with pytest.raises(ParameterError, match=r"methods\[0\].filter\].*'kalman'.*'kallman'"):
+        build(EstimateParams, data, "estimate")
+
+
+# --- study ----------------------------------------------------------------------------------------
+
+START = datetime(2016, 6, 9, tzinfo=UTC)
+STUDY = {"start": START, "end": START + timedelta(hours=1), "step_s": 300}
+
+
+def test_history_begins_before_the_study() -> None:
+    study = build(Study, {**STUDY, "history_s": 7200}, "study")
+    assert study.history_start == datetime(2016, 6, 8, 22, tzinfo=UTC)
+
+
+def test_another_zone_is_the_same_instant() -> None:
+    local = START.astimezone(timezone(timedelta(hours=7)))
+    assert build(Study, {**STUDY, "start": local}, "study").start == START
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"start": datetime(2016, 6, 9)}, r"start has no time zone: expected UTC.*append 'Z'"),
+        ({"start": date(2016, 6, 9)}, r"\[study.start\] expected datetime"),
+        ({"start": "2016-06-09T00:00:00Z"}, r"\[study.start\] expected datetime, received '2016"),
+        ({"end": START}, r"end must lie after start, received 2016-06-09"),
+        ({"step_s": 0}, r"step_s > 0 .* received step_s = 0.0"),
+        ({"step_s": 1e-7}, r"step_s"),
+        ({"history_s": -1}, r"history_s ≥ 0, received .*history_s = -1.0"),
+    ],
+)
+def test_impossible_study_is_refused(change: dict[str, Any], expected: str) -> None:
+    with pytest.raises(PseError, match=expected):
+        build(Study, {**STUDY, **change}, "study")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_step_and_history_must_be_finite_without_a_case_file_too(value: float) -> None:
+    with pytest.raises(ParameterError, match="step_s"):
+        Study(START, START + timedelta(hours=1), value)
+    with pytest.raises(ParameterError, match="history_s"):
+        Study(START, START + timedelta(hours=1), 300.0, value)
