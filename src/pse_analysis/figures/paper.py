@@ -118,7 +118,7 @@ def time_axis(ax: Axes, width: float) -> None:
 
 def legend(figure: Paper, *axes: Axes) -> None:
     """Above the axes, in as many columns as fit, so that it never hides data."""
-    named = {}
+    named: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             named.setdefault(label, handle)

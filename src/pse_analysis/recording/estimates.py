@@ -82,7 +82,6 @@ def estimated(
     shades = _errors(vm, true, network)
     largest = marks.scale_end(pd.concat(shades.values())) if shades else 1.0
     what = "error of |V|" if true is not None else "σ of |V|"
-    scale = f"0 … {1e3 * largest:g} {_UNIT}"
 
     buses = []
     for element in chosen:
@@ -94,7 +93,7 @@ def estimated(
         for name in methods
     ]
     top = float(np.nanquantile(nis, 0.995)) if nis.size and nis.notna().any().any() else 1.0
-    graphs = [marks.grid_view(f"grid/{n}", f"{n}: {what}, {scale}", network) for n in shades]
+    graphs = [marks.grid_view(f"grid/{n}", f"{n}: {what}", network) for n in shades]
     blueprint = marks.panels(
         rrb.Horizontal(
             rrb.Vertical(
@@ -174,10 +173,9 @@ def _draw_nis(
         groups.setdefault(tuple(dof[name].fillna(0.0)), []).append(str(name))
     for number, names in enumerate(groups.values()):
         m = dof[names[0]].where(dof[names[0]] > 0)
-        label = "99 %" if len(groups) == 1 else f"99 %, {', '.join(names)}"
-        limits = pd.DataFrame({f"{label} {side}": chi2.ppf(q, m) / m
-                               for side, q in zip(("low", "high"), BOUNDS, strict=True)},
-                              index=dof.index)  # fmt: skip
+        label = "99 %" if len(groups) == 1 else f"99 % {', '.join(names)}"
+        bounds = np.stack([chi2.ppf(q, m) / m for q in BOUNDS], axis=1)
+        limits = pd.DataFrame(bounds, index=dof.index, columns=[label, label])
         marks.lines(stream, f"nis/bounds_{number}", limits, [marks.BOUND] * 2, width=1.2)
 
 
@@ -266,7 +264,7 @@ def _estimated_text(
 def _grid_text(largest: float) -> str:
     end = 1e3 * largest
     return (
-        f"The colours are those of the time cursor: violet is 0, yellow {end:g} {_UNIT} or more, "
+        f"The colours are those of the time cursor: violet is 0, yellow {end:g} × {_UNIT} or more, "
         f"grey not known; the discs below the grid show the scale in steps of {end / 5:g}. Point "
         "at a bus for its name. Drag the cursor, or press play, to watch the day."
     )
@@ -310,7 +308,7 @@ def scored(
     shades = _errors(vm, true, network)
     largest = marks.scale_end(pd.concat(shades.values())) if shades else 1.0
     what = "error of |V|" if true is not None else "σ of |V|"
-    scale = f"0 … {1e3 * largest:g} {_UNIT}"
+    scale = f"0 to {1e3 * largest:g} × {_UNIT}"
     over_time = {
         "mean": 1e3 * pd.DataFrame({name: v.mean(axis=1) for name, v in shades.items()}),
         "largest": 1e3 * pd.DataFrame({name: v.max(axis=1) for name, v in shades.items()}),

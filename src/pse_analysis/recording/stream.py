@@ -26,6 +26,9 @@ TIMELINE = "time"
 TRUTH = "#B4B4B4"
 BOUND = "#8C8C8C"
 
+# Signs that the viewer's font lacks; its headless mode stops on them.
+_SPELLED = {"∠": "angle of "}
+
 # Of the grid's drawing: distance of neighbours, radius of a bus, and the row of discs below it
 # that is its colour scale.
 _HOP = 40.0
@@ -172,6 +175,7 @@ def lane(
     times: pd.DatetimeIndex,
     states: Sequence[str | None],
     colours: Mapping[str, str],
+    quiet: Sequence[str] = (),
 ) -> None:
     """A lane of states, stored only where the state changes.
 
@@ -187,6 +191,8 @@ def lane(
         None leaves a gap.
     colours : mapping
         Colour by state.
+    quiet : sequence of str
+        States whose name is not written into the lane, because they are the usual ones.
     """
     if not len(times):
         return
@@ -197,7 +203,9 @@ def lane(
     stream.log(
         entity,
         rr.StateConfiguration(
-            values=seen, labels=seen, colors=[_rgb(colours.get(s, BOUND)) for s in seen]
+            values=seen,
+            labels=[" " if s in quiet else s for s in seen],
+            colors=[_rgb(colours.get(s, BOUND)) for s in seen],
         ),
         static=True,
     )
@@ -291,6 +299,8 @@ def bars(
 
 def page(stream: rr.RecordingStream, entity: str, markdown: str) -> None:
     """A page of text."""
+    for missing, spelled in _SPELLED.items():
+        markdown = markdown.replace(missing, spelled)
     document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
     stream.log(entity, document, static=True)
 

@@ -108,7 +108,7 @@ def validated(
             own = samples[samples.channel == name]
             faulty = None if injected is None else injected[injected.channel == name]
             times, states, colours = _findings(own, faulty)
-            marks.lane(stream, marks.entity_path("flags", name), times, states, colours)
+            marks.lane(stream, marks.entity_path("flags", name), times, states, colours, [GOOD])
         text = _findings_text(case, trial, samples, len(channels), injected, len(shown))
         marks.page(stream, "text/validated", text)
 
@@ -209,7 +209,8 @@ def _findings_text(
     some = " (those with findings)" if n_shown < n_channel else ""
     text = [
         f"# {case}: telemetry after the checks",
-        f"Trial {trial} of the case: {len(samples):,} samples of {n_channel} channels. "
+        f"Trial {trial} of the case, history before the study included: {len(samples):,} samples "
+        f"of {n_channel} channels. "
         f"{n_shown} channels have a lane{some}.",
         marks.markdown_table(("flag", "samples"), flags),
         marks.markdown_table(("reason", "samples", "channels"), rows)
@@ -323,7 +324,14 @@ def aligned(
         for name in shown:
             own = table[table.channel == name].set_index("time_utc").origin.reindex(instants)
             states = own.fillna("").tolist()
-            marks.lane(stream, marks.entity_path("origin", name), instants, states, _ORIGINS)
+            marks.lane(
+                stream,
+                marks.entity_path("origin", name),
+                instants,
+                states,
+                _ORIGINS,
+                list(_ORIGINS)[:2],
+            )
         text = _aligned_text(case, trial, variant, table, len(channels), len(shown), true)
         marks.page(stream, "text/aligned", text)
 
