@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable
 from functools import cache
@@ -136,3 +137,48 @@ def channels_table(network: Network, rows: list[dict[str, Any]]) -> pd.DataFrame
         side = np.where(table["side"] == "", "", ":" + table["side"])
         table["channel"] = table["source"] + ":" + table["element"] + side + ":" + table["quantity"]
     return table.astype({"sign": "int8", "period_s": "float64", "sigma": "float64"})
+
+
+def pandapower_wls(
+    name: str, network: Network, layout: SensorLayout, z: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """[θ; |V|] by pandapower's own weighted least squares, θ against the slack's.
+
+    Its conventions: a bus measurement counts consumption positive and, as here, leaves out shunts;
+    powers come in MW; a branch is a line or a transformer with sides of other names.
+    """
+    net = pandapower_measurements(name, network, layout, z, sigma)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pandapower.estimation
+
+        done = pandapower.estimation.estimate(net, tolerance=1e-10, zero_injection=None)
+    assert done if isinstance(done, bool) else done["success"]
+    theta = np.deg2rad(net.res_bus_est.va_degree.to_numpy())
+    return np.concatenate([theta - theta[network.slack], net.res_bus_est.vm_pu.to_numpy()])
+
+
+def pandapower_measurements(
+    name: str, network: Network, layout: SensorLayout, z: np.ndarray, sigma: np.ndarray
+) -> Any:
+    """A copy of pandapower's grid with the layout's values as its measurements."""
+    net = copy.deepcopy(pandapower_grid(name))
+    lines = len(net.line)
+    kind = {VM: "v", P: "p", Q: "q"}
+    rows = []
+    for q, p, s, value, deviation in zip(
+        layout.quantity, layout.position, layout.side, z, sigma, strict=True
+    ):
+        base = 1.0 if q == VM else network.base_mva
+        sign = -1.0 if s == BUS and q != VM else 1.0
+        if s == BUS:
+            element, index, side = "bus", net.bus.index[p], None
+        elif p < lines:
+            element, index, side = "line", net.line.index[p], ("from", "to")[s - FROM]
+        else:
+            element, index, side = "trafo", net.trafo.index[p - lines], ("hv", "lv")[s - FROM]
+        rows.append(
+            (None, kind[int(q)], element, index, sign * value * base, deviation * base, side)
+        )
+    net.measurement = pd.DataFrame(rows, columns=net.measurement.columns)
+    return net
