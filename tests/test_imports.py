@@ -26,7 +26,7 @@ MODULES = {
 LAYERS = (
     ("errors",),
     ("parameters", "vocabulary"),
-    ("grid", "measurement", "telemetry"),
+    ("grid", "machine", "measurement", "telemetry"),
     ("simulation", "validation"),
     ("alignment",),
     ("estimation",),

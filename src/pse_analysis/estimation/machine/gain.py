@@ -13,6 +13,7 @@ from pse_analysis.errors import ParameterError
 from pse_analysis.machine import Densities, Machine, Sampled, sample
 
 FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest count as zero."""
@@ -212,7 +213,7 @@ def filter_gain(P: FloatArray, C: FloatArray, step: Sampled) -> FloatArray:
     return np.asarray(linalg.solve(S, C @ P, assume_a="pos").T)
 
 
-def _place(A: FloatArray, C: FloatArray, poles: FloatArray, *, discrete: bool) -> FloatArray:
+def _place(A: FloatArray, C: FloatArray, poles: ComplexArray, *, discrete: bool) -> FloatArray:
     try:
         placed = signal.place_poles(A.T, C.T, poles)
     except ValueError as error:
@@ -230,7 +231,7 @@ def _place(A: FloatArray, C: FloatArray, poles: FloatArray, *, discrete: bool) -
     return np.asarray(-placed.gain_matrix.T)
 
 
-def _checked_poles(tuning: Poles) -> npt.NDArray[np.complex128]:
+def _checked_poles(tuning: Poles) -> ComplexArray:
     poles = np.asarray(tuning.poles, dtype=complex)
     closed = np.allclose(np.sort_complex(poles), np.sort_complex(poles.conj()))
     if poles.shape != (2,) or not closed or not (poles.real < 0).all():
@@ -251,7 +252,7 @@ def _root(Q: FloatArray) -> FloatArray:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _rank(M: npt.NDArray[np.complex128] | FloatArray) -> int:
+def _rank(M: ComplexArray | FloatArray) -> int:
     # Rows of unlike units: scale them, or a weak disturbance would look like none.
     size = np.abs(M).max(axis=1, keepdims=True)
     return int(np.linalg.matrix_rank(M / np.where(size > 0, size, 1.0), tol=RANK_TOLERANCE))

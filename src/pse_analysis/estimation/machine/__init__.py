@@ -1,0 +1,43 @@
+"""Observers of a synchronous machine: gains, what they are worth, and their run on telemetry."""
+
+from pse_analysis.estimation.machine.gain import (
+    Finding,
+    Poles,
+    Tuning,
+    continuous_gain,
+    discrete_gain,
+    findings,
+    gain_without_damping,
+    require_solvable,
+)
+from pse_analysis.estimation.machine.observer import ObserverState, observe, observer
+from pse_analysis.estimation.machine.tuning import (
+    ModelError,
+    Tuned,
+    continuous_covariance,
+    discrete_covariance,
+    model_error,
+    rms,
+    tune,
+)
+
+__all__ = [
+    "Finding",
+    "ModelError",
+    "ObserverState",
+    "Poles",
+    "Tuned",
+    "Tuning",
+    "continuous_covariance",
+    "continuous_gain",
+    "discrete_covariance",
+    "discrete_gain",
+    "findings",
+    "gain_without_damping",
+    "model_error",
+    "observe",
+    "observer",
+    "require_solvable",
+    "rms",
+    "tune",
+]
