@@ -101,8 +101,8 @@ def places(result: Result) -> list[tuple[str, str]]:
             joined = names[0] if len(names) == 1 else f"{{{','.join(names)}}}"
             found.append((stage, f"{_near(entry.folder)}/{joined}"))
     if result.recordings:
-        names = ", ".join(path.name for path in result.recordings)
-        found.append(("recordings", f"{names} beside them; open: pse view {result.case.name}"))
+        files = ", ".join(path.name for path in result.recordings)
+        found.append(("recordings", f"{files} beside them; open: pse view {result.case.name}"))
     notebook = result.case.notebook
     if notebook and (project_root() / notebook).is_file():
         found.append(("notebook", f"{_near(project_root() / notebook)}"))
