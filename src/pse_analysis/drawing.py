@@ -95,9 +95,11 @@ def method_colours(methods: Iterable[str]) -> dict[str, str]:
     Returns
     -------
     dict
-        Hexadecimal colour by method, in the order given.
+        Hexadecimal colour by method: the methods of `METHODS` in their order there, then others as
+        given.
     """
-    names = list(dict.fromkeys(methods))
+    given = dict.fromkeys(methods)
+    names = [*(name for name in METHODS if name in given), *(n for n in given if n not in METHODS)]
     colours = {name: METHODS[name] for name in names if name in METHODS}
     for name in sorted(set(names) - set(METHODS)):
         start = zlib.crc32(name.encode())

@@ -109,7 +109,7 @@ def time_axis(ax: Axes, width: float) -> None:
     formatter = ConciseDateFormatter(
         locator,
         zero_formats=["", "%Y", "%b", "%-d %b", "%H:%M", "%H:%M"],
-        offset_formats=["", "%Y", "%Y", "%Y", "%Y", "%Y"],
+        offset_formats=["", "%Y", "%b %Y", "%Y", "%Y", "%Y"],
     )
     ax.xaxis.set_major_formatter(formatter)
     ax.set_xlabel("Time [UTC]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -50,7 +51,7 @@ def errors_by_bus(
         )
     factor, unit = thousandths(rows.unit.iloc[0])
     table = factor * rows.pivot_table(index="element", columns="method", values="value")
-    table = table.reindex(list(dict.fromkeys(rows.element)))
+    table = table.reindex(sorted(table.index, key=_by_number))
     colours = method_colours(dict.fromkeys(scored.method[scored.method != "validate"]))
     figure = paper(width, 2.4)
     ax = figure.subplots()
@@ -99,18 +100,18 @@ def consistency(
     ax = axes[0]
     own = steps[(steps.trial == trial) & (steps.dof > 0)].sort_values("time_utc")
     colours = method_colours(dict.fromkeys(steps.method))
-    drawn: set[tuple[int, ...]] = set()
+    alike: dict[tuple[int, ...], list[str]] = {}
     for name, colour in colours.items():
         one = own[own.method == name]
         ax.plot(one.time_utc, one.nis / one.dof, color=colour, lw=0.9, label=name)
+        alike.setdefault(tuple(one.dof), []).append(name)
+    for names in alike.values():
+        one = own[own.method == names[0]]
         m = one.dof.to_numpy()
-        if tuple(m) in drawn:
-            continue
-        drawn.add(tuple(m))
-        alone = len({tuple(g.dof) for _, g in own.groupby("method")}) == 1
-        for number, q in enumerate(BOUNDS):
-            label = "99 % bounds" + ("" if alone else f" of {name}") if number == 0 else None
-            line = TRUTH if alone else colour
+        line, label = TRUTH, "99 % bounds"
+        if len(alike) > 1:
+            line, label = colours[names[-1]], f"99 % bounds of {', '.join(names)}"
+        for q in BOUNDS:
             ax.plot(one.time_utc, chi2.ppf(q, m) / m, color=line, lw=0.8, ls=":", label=label)
     ax.set_ylabel("NIS / degrees of freedom [1]")
     ax.set_ylim(bottom=0)
@@ -169,6 +170,13 @@ def _coverage(
     ax.set_ylabel(f"{'|V|' if metric.endswith('vm') else 'Angle'} within ±2σ [%]")
 
 
+def _by_number(element: str) -> list[tuple[int, str]]:
+    """Sorts ``bus/2`` before ``bus/10``."""
+    return [
+        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", element)
+    ]
+
+
 def score_table(scored: pd.DataFrame) -> pd.DataFrame:
     """Scores of the whole case, a row per method; trials are brought together.
 
@@ -196,7 +204,7 @@ def score_table(scored: pd.DataFrame) -> pd.DataFrame:
         "steps_not_ok": ("steps not ok", "sum"),
         "seconds": ("time [s]", "sum"),
     }
-    table = pd.DataFrame(index=pd.Index(list(dict.fromkeys(rows.method)), name="method"))
+    table = pd.DataFrame(index=pd.Index(list(method_colours(rows.method)), name="method"))
     for metric, (title, how) in columns.items():
         own = rows[rows.metric == metric]
         if own.empty or own.value.isna().all():

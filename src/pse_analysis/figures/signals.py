@@ -84,7 +84,8 @@ def voltage(
         ax.plot(true.time_utc, true.value, color=TRUTH, lw=1.0, ls=(0, (4, 1.5)), label="true")
     if aligned is not None:
         ends = aligned.channel.str.endswith(f":{element}:{quantity}")
-        seen = aligned[ends & (aligned.trial == trial) & (aligned.origin == "measured")]
+        inside = aligned.time_utc.between(own.time_utc.min(), own.time_utc.max())
+        seen = aligned[ends & inside & (aligned.trial == trial) & (aligned.origin == "measured")]
         scale = 180.0 / np.pi if quantity == "va_degree" else 1.0
         for source, part in seen.groupby(seen.channel.str.split(":").str[0], sort=False):
             colour = SOURCES.get(str(source), MEASURED)
@@ -103,6 +104,7 @@ def flags(
     channel: str,
     *,
     sample_truth: pd.DataFrame | None = None,
+    window: tuple[pd.Timestamp, pd.Timestamp] | None = None,
     unit: str | None = None,
     trial: int = 0,
     width: float = DOUBLE,
@@ -117,6 +119,8 @@ def flags(
         Such as ``scada:bus/6:vm_pu``.
     sample_truth : DataFrame, optional
         Draws the true value of each sample.
+    window : pair of Timestamp, optional
+        Samples stamped from the first to the second are drawn; default: all.
     unit : str, optional
         The channel's unit; default: the one that its quantity's name carries.
     trial : int
@@ -136,12 +140,14 @@ def flags(
         raise TableError(
             f"no sample of channel {channel!r} in trial {trial}; expected a channel such as {known}"
         )
+    if window is not None:
+        own = own[own.time_utc.between(*map(pd.Timestamp, window))]
     figure = paper(width, 2.5)
     ax = figure.subplots()
     if sample_truth is not None:
         true = sample_truth[(sample_truth.trial == trial) & (sample_truth.channel == channel)]
-        true = true.sort_values("time_utc")
-        ax.plot(true.time_utc, true.value, color=TRUTH, lw=0.8, label="true")
+        true = true[true.seq.isin(own.seq)].sort_values("time_utc")
+        ax.plot(true.time_utc, true.value, color=TRUTH, lw=0.8, label="true", zorder=2.5)
     good = own[own.flag == Flag.GOOD]
     ax.plot(good.time_utc, good.value, ".", ms=2.5, color=MEASURED, label="good")
     bits = own.reasons.to_numpy()

@@ -199,13 +199,14 @@ def _errors(
     shades = {}
     if true is not None:
         table = true.pivot_table(index="time_utc", columns="element", values="value")
-    for name, one in vm.groupby("method", sort=False):
+    for name in method_colours(vm.method.unique()):
+        one = vm[vm.method == name]
         which = "value" if true is not None else "sigma"
         values = one.pivot_table(index="time_utc", columns="element", values=which, dropna=False)
         values = values.reindex(columns=buses)
         if true is not None:
             values = (values - table.reindex(index=values.index, columns=buses)).abs()
-        shades[str(name)] = values
+        shades[name] = values
     return shades
 
 
@@ -318,35 +319,25 @@ def scored(
         index="element", columns="method", values="value"
     ).reindex([f"bus/{name}" for name in network.buses.name])  # fmt: skip
 
-    plots: list[rrb.View | rrb.Container] = [
-        rrb.Tabs(
-            *(
-                window.plot(
-                    f"error/{kind}", f"{kind} {what} over the buses [{_UNIT}]", v, zero=True
-                )
-                for kind, v in over_time.items()
-            )
-        )
+    errors = [
+        window.plot(f"error/{kind}", f"{kind} {what} [{_UNIT}]", values, zero=True)
+        for kind, values in over_time.items()
     ]
+    below: list[rrb.View] = []
     if bars.notna().any().any():
-        plots.append(
-            rrb.BarChartView(
-                origin="error/by_bus",
-                name=f"mean error of |V| by bus [{_UNIT}]",
-                plot_legend=rrb.PlotLegend(visible=False),
-            )
-        )
+        legend = rrb.PlotLegend(visible=False)
+        title = f"mean error of |V| by bus [{_UNIT}]"
+        below.append(rrb.BarChartView(origin="error/by_bus", name=title, plot_legend=legend))
+    graphs = [marks.grid_view(f"score_grid/{n}", f"{n}: {what}, {scale}", network) for n in shades]
     blueprint = marks.panels(
         rrb.Horizontal(
-            rrb.TextDocumentView(origin="text/scored", name="score"),
             rrb.Vertical(
-                *(
-                    marks.grid_view(f"score_grid/{n}", f"{n}: {what}, {scale}", network)
-                    for n in shades
-                )
+                rrb.TextDocumentView(origin="text/scored", name="score"),
+                rrb.Tabs(*errors),
+                row_shares=[5, 4],
             ),
-            rrb.Vertical(*plots),
-            column_shares=[5, 7, 7],
+            rrb.Vertical(*graphs, *below),
+            column_shares=[10, 9],
         )
     )
     with marks.recording(path, case, blueprint) as stream:
@@ -363,11 +354,11 @@ def scored(
             "## What is to be seen",
             f"The drawings show trial {trial} of the case.",
             f"**Grid**: {what} of each method on one scale. {_grid_text(largest)}",
-            f"**Right**: mean {what} over the buses at each instant; another tab has the largest.",
+            f"**Below**: mean {what} over the buses at each instant; another tab has the largest.",
         ]
-        if bars.notna().any().any():
+        if below:
             guide.append(
-                "**Right, below**: the mean over the study in the order of the buses, "
-                "with the colours of the plot above it."
+                "**Right, at the foot**: the mean over the study in the order of the buses, in "
+                "the methods' colours."
             )
         marks.page(stream, "text/scored", "\n\n".join(guide))
