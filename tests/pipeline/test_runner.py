@@ -49,6 +49,7 @@ def fake(stage: Stage) -> Callable[[Job], None]:
 
 
 WORK = {stage.name: fake(stage) for stage in STAGES}
+RUN = runner.run
 
 
 @pytest.fixture
@@ -211,8 +212,7 @@ class TestCommandLine:
 
     @pytest.fixture(autouse=True)
     def fakes(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        real = runner.run
-        monkeypatch.setattr(runner, "run", lambda n, o, r: real(n, o, r, work=WORK))
+        monkeypatch.setattr(runner, "run", lambda n, o, r: RUN(n, o, r, work=WORK))
 
     def test_run_prints_stages_summary_and_places(
         self, options: Options, capsys: pytest.CaptureFixture[str]
@@ -292,3 +292,23 @@ class TestCommandLine:
     ) -> None:
         assert cli.main(["view", *self.arguments(options, "small")[1:]]) == 1
         assert "pse run small" in capsys.readouterr().err
+
+    def test_view_opens_the_recordings_on_this_machine_only(
+        self, options: Options, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def record(job: Job) -> None:
+            WORK["validate"](job)
+            (job.output / "validate.rrd").write_text("x")
+
+        monkeypatch.setattr(
+            runner, "run", lambda n, o, r: RUN(n, o, r, work={**WORK, "validate": record})
+        )
+        started: list[list[str]] = []
+        monkeypatch.setattr("os.execv", lambda _, command: started.append(command))
+        monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
+        assert cli.main(self.arguments(options, "small", "--force")) == 0
+        cli.main(["view", *self.arguments(options, "small")[1:]])
+        (command,) = started
+        assert command[0].endswith("rerun")
+        assert command[1].endswith("validate.rrd")
+        assert command[2:] == ["--bind", "127.0.0.1"]

@@ -122,10 +122,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
-    parser = argparse.ArgumentParser(
+    return _guarded(parser().parse_args(arguments))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Parser of the arguments of ``pse``."""
+    whole = argparse.ArgumentParser(
         prog="pse", description="Power-system state estimation from raw telemetry to a score."
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = whole.add_subparsers(required=True, metavar="COMMAND")
     run_parser = commands.add_parser("run", help="run the stages of a case that are not current")
     _add_run_arguments(run_parser)
     run_parser.set_defaults(command=_run)
@@ -136,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     view_parser.add_argument("case", metavar="CASE")
     _add_folders(view_parser)
     view_parser.set_defaults(command=_view)
-    return _guarded(parser.parse_args(arguments))
+    return whole
 
 
 def run_main(arguments: Sequence[str] | None = None) -> int:

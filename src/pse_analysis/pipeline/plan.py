@@ -35,6 +35,8 @@ class Stage:
         Files and folders of the raw folder.
     tables : tuple of (str, str)
         Tables of earlier stages: the stage and the table.
+    leaves : tuple of str
+        Modules that show its result.
     """
 
     name: str
@@ -42,10 +44,11 @@ class Stage:
     keys: tuple[str, ...]
     raw: tuple[str, ...] = ()
     tables: tuple[tuple[str, str], ...] = ()
+    leaves: tuple[str, ...] = ("pse_analysis.recording",)
 
 
 STAGES = (
-    Stage("simulate", "pse_analysis.simulation", keys=("grid", "study", "simulate")),
+    Stage("simulate", "pse_analysis.simulation", keys=("grid", "study", "simulate"), leaves=()),
     Stage(
         "validate",
         "pse_analysis.validation",
@@ -77,6 +80,7 @@ STAGES = (
             ("estimate", "residuals"),
             ("estimate", "steps"),
         ),
+        leaves=("pse_analysis.recording", "pse_analysis.pipeline.summary"),
     ),
 )
 NAMES = tuple(stage.name for stage in STAGES)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pse_analysis.grid.network import Network
+    from pse_analysis.pipeline.stages import Parameters
 
 RAW_TABLES = ("telemetry", "channels", "truth", "sample_truth", "faults")
 
@@ -57,6 +58,13 @@ class Results(Mapping[str, "pd.DataFrame"]):
         from pse_analysis.pipeline.tables import read_network
 
         return read_network(self.raw_folder)
+
+    @property
+    def parameters(self) -> Parameters:
+        """Frozen parameters of every stage, as the case file states them."""
+        from pse_analysis.pipeline.stages import check_case
+
+        return check_case(self.case)
 
     def __getitem__(self, table: str) -> pd.DataFrame:
         if table not in self._read:

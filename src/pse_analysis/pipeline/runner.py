@@ -24,7 +24,6 @@ from pse_analysis.pipeline.fingerprint import (
     describe_folder,
     digest_code,
     fingerprint,
-    module_file,
 )
 from pse_analysis.pipeline.plan import (
     NAMES,
@@ -41,10 +40,10 @@ T = TypeVar("T")
 
 PROFILES = "load_profiles"
 
-# Modules behind every stage: the tables' forms, their files and their recordings. The module that
-# calls the stages counts by its own text only: it imports them all.
-_SHARED = ("pse_analysis.telemetry", "pse_analysis.vocabulary", "pse_analysis.recording")
-_CALLER = "pse_analysis.pipeline.stages"
+# Modules behind every stage: the tables' forms and files. What calls the stages counts by its own
+# text only: it imports them all.
+_SHARED = ("pse_analysis.telemetry", "pse_analysis.vocabulary")
+_CALLERS = ("pse_analysis.pipeline.stages", "pse_analysis.pipeline.tables")
 
 
 def profiles_folder(data: Path) -> Path:
@@ -67,8 +66,7 @@ def parameters(case: Case, stage: Stage) -> dict[str, Any]:
 
 def code(stage: Stage) -> dict[str, str]:
     """Digest of each module the stage uses."""
-    roots = [stage.module, *(m for m in _SHARED if module_file(m) is not None)]
-    return digest_code([*closure(*roots), _CALLER])
+    return digest_code([*closure(stage.module, *_SHARED, *stage.leaves), *_CALLERS])
 
 
 def run(

@@ -1,0 +1,56 @@
+"""Claim: the table that ends a run brings trials together and shows only what is known."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+from pse_analysis.pipeline.summary import detection, markdown, text
+
+ROWS = [
+    ("wls", 0, "vm_error_mean", "", 0.001, "pu"),
+    ("wls", 1, "vm_error_mean", "", 0.003, "pu"),
+    ("wls", 0, "vm_error_max", "", 0.010, "pu"),
+    ("wls", 1, "vm_error_max", "", 0.020, "pu"),
+    ("wls", 0, "vm_error_max", "bus/6", 0.5, "pu"),
+    ("wls", 0, "va_error_mean", "", 0.001, "rad"),
+    ("wls", 0, "coverage_vm", "", 0.95, ""),
+    ("wls", 0, "nis_ratio", "", float("nan"), ""),
+    ("validate", 0, "found", "", 6.0, ""),
+    ("validate", 1, "found", "", 2.0, ""),
+    ("validate", 0, "missed", "", 2.0, ""),
+    ("validate", 0, "false_alarms", "", 1.0, ""),
+]
+
+
+@pytest.fixture
+def scored() -> pd.DataFrame:
+    columns = ["method", "trial", "metric", "element", "value", "unit"]
+    return pd.DataFrame(ROWS, columns=columns)
+
+
+def test_means_are_averaged_and_largest_errors_are_not(scored: pd.DataFrame) -> None:
+    line = next(line for line in text("a case", scored).splitlines() if "wls" in line)
+    # Thousandths of p.u., thousandths of a degree, shares; unknown metrics stay a dash.
+    assert line.split() == ["wls", "2.000", "20.00", "57.3", "–", "–", "95.0%", "–", "–", "–"]
+
+
+def test_text_fits_any_terminal_of_100_columns(scored: pd.DataFrame) -> None:
+    lines = text("a case", scored).splitlines()
+    assert max(map(len, lines)) <= 100
+    assert not any(line.endswith(" ") for line in lines)
+
+
+def test_bad_data_are_counted_over_trials(scored: pd.DataFrame) -> None:
+    assert detection(scored) == (
+        "bad data: 8 of 10 found (recall 80%), 2 missed, 1 false alarms (precision 89%)"
+    )
+
+
+def test_case_without_record_of_faults_says_so(scored: pd.DataFrame) -> None:
+    assert "no record" in detection(scored[scored.method != "validate"])
+
+
+def test_bars_of_magnitudes_do_not_break_the_markdown_table(scored: pd.DataFrame) -> None:
+    rows = [line for line in markdown("a case", scored).splitlines() if line.startswith("|")]
+    assert len({line.replace("\\|", "").count("|") for line in rows}) == 1
