@@ -196,9 +196,9 @@ def _samples(channels, times, vm, network, rng) -> pd.DataFrame:
             spikes = rng.choice(n_instant, 3, replace=False) + 10 if number % 2 == 0 else []
             value[spikes] += 0.2
             reasons[spikes] = int(Reason.LIMIT)
-            reasons[100:112] |= int(Reason.STUCK) if number % 5 == 0 else 0
+            reasons[30:42] |= int(Reason.STUCK) if number % 5 == 0 else 0
             if number == 3:
-                value[50], reasons[50] = np.nan, int(Reason.NOT_FINITE)
+                value[25], reasons[25] = np.nan, int(Reason.NOT_FINITE)
             rows.append(
                 pd.DataFrame(
                     {

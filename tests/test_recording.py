@@ -18,7 +18,7 @@ from pse_analysis.grid import library
 
 @pytest.fixture(scope="module")
 def tables() -> StudyTables:
-    return study_tables(n_instant=96)
+    return study_tables(n_instant=48, n_trial=1)
 
 
 @pytest.fixture(scope="module")
@@ -93,17 +93,18 @@ def test_validated_holds_samples_truth_and_a_lane_per_channel(folder, tables):
     lanes = {e for e in found if e.startswith("flags/")}
     assert lanes == {f"flags/{c.replace(':', '/')}" for c in tables.channels.channel}
     for part in ("true", "usable", "bad"):
-        assert any(e.startswith("telemetry/") and e.endswith(part) for e in found)
+        assert any(e.startswith("telemetry/") and e.endswith(f"_{part}") for e in found)
 
 
-def test_estimated_holds_truth_measurements_and_a_band_per_method(folder):
+def test_estimated_holds_truth_measurements_and_a_band_per_method(folder, tables):
     found = entities(folder / "simulated" / "estimate.rrd")
-    # Bus 30 has the lowest voltage of the made-up study and no meter.
-    bands = {e for e in found if e.startswith("vm/bus/30/")}
-    assert bands == {f"vm/bus/30/{x}" for x in ("1_true", "3_wls", "4_kf_scalar", "5_kf_load")}
-    assert any(e.startswith(f"vm/bus/{VM_BUSES[1]}/2_measured") for e in found) or any(
-        "2_measured" in e for e in found
-    )
+    first = tables.estimated[tables.estimated.trial == 0]
+    mean = first[first.quantity == "vm_pu"].groupby("element").value.mean()
+    bands = ("1_true", "3_wls", "4_kf_scalar", "5_kf_load")
+    # The weakest bus is always drawn, and of the metered ones the first.
+    for element in (mean.idxmin(), f"bus/{VM_BUSES[0]}"):
+        assert {f"vm/{element}/{band}" for band in bands} <= found
+    assert f"vm/bus/{VM_BUSES[0]}/2_measured/scada" in found
     for method in ("wls", "kf_scalar", "kf_load"):
         assert {f"grid/{method}", f"normalised/{method}", f"status/{method}"} <= found
     assert {"nis/methods", "nis/bounds_0", "text/estimated"} <= found
@@ -119,7 +120,7 @@ def test_without_truth_the_recordings_say_nothing_of_it(folder):
     for stage in STAGES:
         found = entities(folder / "real" / f"{stage}.rrd")
         assert f"text/{stage}d" in found or f"text/{stage}ed" in found
-        assert not any(e.split("/")[-1] in ("true", "1_true") for e in found)
+        assert not any(e.split("/")[-1] in ("true", "1_true", "2_true") for e in found)
     # The grid then shows the estimate's own σ.
     assert "grid/wls" in entities(folder / "real" / "estimate.rrd")
 

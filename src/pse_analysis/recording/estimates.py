@@ -337,7 +337,7 @@ def scored(
                 row_shares=[5, 4],
             ),
             rrb.Vertical(*graphs, *below),
-            column_shares=[10, 9],
+            column_shares=[11, 9],
         )
     )
     with marks.recording(path, case, blueprint) as stream:

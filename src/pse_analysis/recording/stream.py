@@ -27,7 +27,7 @@ TRUTH = "#B4B4B4"
 BOUND = "#8C8C8C"
 
 # Signs that the viewer's font lacks; its headless mode stops on them.
-_SPELLED = {"∠": "angle of "}
+_SPELLED = {"∠": "angle "}
 
 # Of the grid's drawing: distance of neighbours, radius of a bus, and the row of discs below it
 # that is its colour scale.

@@ -87,7 +87,9 @@ def validated(
     units = channels.set_index("channel").unit
     series = []
     for name in plotted:
-        own = samples[samples.channel == name]
+        own = samples[
+            (samples.channel == name) & samples.time_utc.between(window.start, window.end)
+        ]
         title = f"{name.replace(':', ' ')} [{units.get(name, '')}]"
         series.append(window.plot(marks.entity_path("telemetry", name), title, own.value))
     blueprint = marks.panels(
@@ -119,15 +121,16 @@ def _draw_samples(
     stream: rr.RecordingStream, name: str, own: pd.DataFrame, true: pd.DataFrame | None
 ) -> None:
     entity = marks.entity_path("telemetry", name)
+    # The viewer draws entities in the order of their names: the truth must not hide in the dots.
     if true is not None and len(true):
         line = true.sort_values("time_utc", kind="stable")
         frame = pd.DataFrame({"true value": line.value.to_numpy()}, index=line.time_utc)
-        marks.lines(stream, f"{entity}/true", frame, [marks.TRUTH], width=2.5)
+        marks.lines(stream, f"{entity}/2_true", frame, [marks.TRUTH], width=1.8)
     finite = own[np.isfinite(own.value)]
     good = usable(finite.flag)
     for part, label, chosen, colour, size in (
-        ("usable", "usable sample", good, SKY, 2.0),
-        ("bad", "flagged bad", ~good, VERMILION, 4.0),
+        ("1_usable", "usable sample", good, SKY, 2.0),
+        ("3_bad", "flagged bad", ~good, VERMILION, 4.0),
     ):
         some = finite[chosen]
         frame = pd.DataFrame({label: some.value.to_numpy()}, index=some.time_utc)
