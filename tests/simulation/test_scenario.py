@@ -12,7 +12,7 @@ import simulated_case
 from simulated_case import PARAMS, STUDY, curves, feeder
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.grid import library
+from pse_analysis.grid import library, power_flow
 from pse_analysis.grid.network import BusKind
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 from pse_analysis.simulation import scenario
@@ -142,3 +142,15 @@ def test_source_voltage_is_slow_bounded_and_steps():
 def test_times_off_the_truth_grid_are_refused(study, message: str):
     with pytest.raises(ParameterError, match=message):
         simulated_case.make(study=study)
+
+
+@pytest.mark.parametrize("grid", ["ieee14", "ieee33", "ieee118"])
+def test_states_found_with_one_jacobian_are_those_of_newton_from_a_flat_start(grid: str):
+    network = library.load(grid)
+    level = np.linspace(0.05, 1.5, 12)
+    p, q = (np.outer(v, level) for v in (network.p_nominal_pu, network.q_nominal_pu))
+    vm_set = np.repeat(network.buses.vm_set_pu[:, None], 12, axis=1)
+    vm_set[network.slack] += np.linspace(-0.02, 0.02, 12)
+    solved = scenario._solve(network, np.arange(12), p, q, vm_set)
+    exact = power_flow.solve(network, p, q, vm_set, tolerance=1e-12)
+    np.testing.assert_allclose(solved.x, exact.x, atol=1e-7)
