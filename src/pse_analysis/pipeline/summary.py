@@ -40,7 +40,7 @@ COLUMNS: tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...] =
 )
 """Metric, heading, how trials become one number, and format."""
 
-UNITS = "errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
+UNITS = "Errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
 
 # Errors are small: shown in thousandths, and angles in degrees, as everywhere a person reads them.
 _SCALE = {"pu": 1e3, "rad": 1e3 * 180.0 / math.pi, "degree": 1e3}
@@ -57,7 +57,7 @@ def text(title: str, scored: pd.DataFrame) -> str:
         Table of that name; only rows of the whole case (element "") are shown, and trials are
         brought together: largest errors by their maximum, times by their sum, others by their mean.
     """
-    table = Table(title=_title(title, scored), title_style="", box=box.SIMPLE_HEAD)
+    table = Table(title=f"{_title(title, scored)}\n{UNITS}", title_style="", box=box.SIMPLE_HEAD)
     table.add_column("\nmethod", no_wrap=True)
     for _, heading, _, _ in COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
@@ -77,7 +77,9 @@ def markdown(title: str, scored: pd.DataFrame) -> str:
     rule = ["---", *("---:" for _ in COLUMNS)]
     lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in _rows(scored)]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
-    return "\n".join([f"# {_title(title, scored)}", "", *table, *lines, "", detection(scored)])
+    return "\n".join(
+        [f"# {_title(title, scored)}", "", f"{UNITS}.", "", *table, *lines, "", detection(scored)]
+    )
 
 
 def detection(scored: pd.DataFrame) -> str:
@@ -101,7 +103,7 @@ def detection(scored: pd.DataFrame) -> str:
 
 def _title(title: str, scored: pd.DataFrame) -> str:
     trials = scored.loc[scored["method"] != "validate", "trial"].nunique()
-    return f"{title} ({trials} trial{'s' if trials != 1 else ''}; {UNITS})"
+    return f"{title} ({trials} trial{'s' if trials != 1 else ''})"
 
 
 def _rows(scored: pd.DataFrame) -> list[list[str]]:

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
-from pse_analysis.telemetry import read_table, read_telemetry
-
-GRID = ("network", "buses", "branches")
+from pse_analysis.machine import Machine
+from pse_analysis.telemetry import read_model, read_table, read_telemetry
 
 
 def read_network(raw: Path) -> Network:
@@ -22,19 +20,12 @@ def read_network(raw: Path) -> Network:
     Raises
     ------
     TableError
-        If one of its files is missing or not whole.
+        If one of its files is missing or not whole, or the case is about a machine.
     """
-    tables = {}
-    for name in GRID:
-        path = raw / "grid" / f"{name}.parquet"
-        try:
-            tables[name] = pq.ParquetFile(path).read().to_pandas()
-        except (pa.ArrowInvalid, OSError) as error:
-            raise TableError(
-                f"grid: {path} is missing or not a whole parquet file ({error}): write it with "
-                "pse_analysis.telemetry.write_raw"
-            ) from error
-    return Network.from_tables(**tables)
+    model = read_model(raw)
+    if isinstance(model, Machine):
+        raise TableError(f"{raw} holds {model.element}, not a grid: use read_model")
+    return model
 
 
 def read_raw_table(raw: Path, table: str) -> pd.DataFrame | None:
