@@ -197,3 +197,20 @@ def test_tiny_tables_pass_through(n: int) -> None:
     out = validate(telemetry(walk(n)), channels(), history_end=HISTORY_END)
     assert len(out) == n
     assert not out["flag"].any()
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("degree", 360.0), ("rad", 2.0 * np.pi)])
+def test_the_end_of_a_turn_is_no_jump_of_an_angle(unit: str, turn: float) -> None:
+    degrees = np.random.default_rng(14).normal(0.0, 0.1, 900) + 3.0 * np.sin(np.arange(900) / 40.0)
+    angle = (180.0 + degrees) / 360.0 * turn
+    angle[600] += 0.2 * turn
+    wrapped = np.mod(angle + 0.5 * turn, turn) - 0.5 * turn
+    assert (np.abs(np.diff(wrapped[:288])) > 0.5 * turn).any()
+    assert (np.abs(np.diff(wrapped[300:])) > 0.5 * turn).any()
+    own = channels(quantity="va_degree", unit=unit, lower=np.nan, upper=np.nan)
+    found, straight = (
+        validate(telemetry(x), own, history_end=HISTORY_END) for x in (wrapped, angle)
+    )
+    assert found["flag"].iloc[600] == Flag.BAD
+    pd.testing.assert_series_equal(found["reasons"], straight["reasons"])
+    np.testing.assert_allclose(found["threshold"], straight["threshold"], rtol=1e-9)

@@ -47,6 +47,7 @@ def decide(
     structure: Structure | None,
     sigma: Array,
     scan_k: Array | None = None,
+    turn: Array | None = None,
 ) -> Criteria:
     """Thresholds of every channel by its rule's criterion.
 
@@ -61,6 +62,8 @@ def decide(
         [unit]
     scan_k : (n_channel,), optional
         The scanned coefficient, for rules that ask for it.
+    turn : (n_channel,), optional
+        Full turn of the channels that measure angles, inf for the rest. [unit]
 
     Raises
     ------
@@ -121,6 +124,7 @@ def decide(
             increment=increment,
             extrapolation=sharper,
             confirm=np.array([r.confirm or 1 for r in rules], dtype=np.int64),
+            turn=np.full(n, np.inf) if turn is None else turn,
         ),
         stuck=np.where(checks_stuck, stuck, 0),
         stuck_at_zero=np.array([bool(r.stuck_at_zero) for r in rules], dtype=bool),

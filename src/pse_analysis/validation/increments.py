@@ -138,6 +138,15 @@ def learn(
     return Structure(variance, count, repeats, scale)
 
 
+def unwound(x: Array, turn: Array) -> Array:
+    """Angles as they would read without the jump at the end of a turn, (n, n_channel)."""
+    out = x.copy()
+    for lane in np.flatnonzero(np.isfinite(turn)):
+        here = np.isfinite(x[:, lane])
+        out[here, lane] = np.unwrap(x[here, lane], period=turn[lane])
+    return out
+
+
 def isolated(
     x: Array,
     t: Array,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,9 @@ class Motion:
         Threshold of the extrapolation check over the σ of its error; inf where it is not made.
     confirm : (n_channel,)
         Samples that must agree with a flagged one before the step is accepted.
+    turn : (n_channel,)
+        Full turn of an angle, in whose changes whole turns do not count; inf for the rest, and
+        where nothing is given. [unit]
     """
 
     structure: Array
@@ -38,14 +41,17 @@ class Motion:
     increment: Array
     extrapolation: Array
     confirm: Ints
+    turn: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
+        if not len(self.turn):
+            object.__setattr__(self, "turn", np.full(len(self.k), np.inf))
         shape = np.shape(self.structure)
         if len(shape) != 2 or shape[1] < 3:
             raise ValueError(
                 f"structure has shape {shape}: expected (n_channel, n_lag + 1) with n_lag ≥ 2"
             )
-        for name in ("k", "increment", "extrapolation", "confirm"):
+        for name in ("k", "increment", "extrapolation", "confirm", "turn"):
             if getattr(self, name).shape != shape[:1]:
                 raise ValueError(
                     f"{name} has shape {getattr(self, name).shape}: expected {shape[:1]}, "
@@ -152,6 +158,13 @@ def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> Array:
     weight = np.maximum(m - i, 0)
     s2 = np.square(np.asarray(sigma, dtype=float))[..., None]
     return np.asarray(s2 * (np.arange(n_lag + 1) + 2.0 * (r @ weight.T)))
+
+
+def shortest(change: Array, turn: float | Array) -> Array:
+    """Change of an angle without whole turns; unchanged where the turn is infinite."""
+    with np.errstate(invalid="ignore"):
+        less = change - turn * np.rint(change / turn)
+    return np.asarray(np.where(np.isinf(turn), change, less))
 
 
 def times_sigma(quantile: Array, sigma: Array) -> Array:

@@ -15,7 +15,7 @@ from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.validation import extrapolation
 from pse_analysis.validation.block import RULED_OUT, Criteria, screen
 from pse_analysis.validation.criteria import decide
-from pse_analysis.validation.increments import Structure, learn
+from pse_analysis.validation.increments import Structure, learn, unwound
 from pse_analysis.validation.rules import Rule, ValidateParams, resolve
 from pse_analysis.validation.timing import Stamps, time_reasons
 from pse_analysis.vocabulary import Reason
@@ -28,6 +28,9 @@ log = logging.getLogger(__name__)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECONDS = 1e6
 _DAY = 86_400_000_000
+
+TURNS = {"degree": 360.0, "rad": 2.0 * np.pi}
+"""Full turn of an angle in the units it may have."""
 
 
 def validate(
@@ -99,9 +102,10 @@ def validate(
 
     statistic, threshold = np.full(len(value), np.nan), np.full(len(value), np.nan)
     sigma, relative = _sigmas(channels, lane_channel)
+    turn = channels["unit"].map(TURNS).fillna(np.inf).to_numpy(dtype=float)[lane_channel]
     for lanes in _alike(stamps.length, lane_rules):
         _screen_lanes(
-            lanes, stamps, value, period, lane_rules, history, until, sigma, relative,
+            lanes, stamps, value, period, lane_rules, history, until, sigma, relative, turn,
             reasons, backward, statistic, threshold,
         )  # fmt: skip
 
@@ -127,6 +131,7 @@ def _screen_lanes(
     until: int | None,
     sigma: Array,
     relative: npt.NDArray[np.bool_],
+    turn: Array,
     reasons: npt.NDArray[np.int32],
     backward: npt.NDArray[np.bool_],
     statistic: Array,
@@ -155,12 +160,12 @@ def _screen_lanes(
         limits = decide(chosen, None, noise)
         past &= ~(x < limits.lower) & ~(x > limits.upper)
         depth = int(np.flatnonzero(past.any(axis=1)).max(initial=-1)) + 1
-        seen = np.where(past[:depth], x[:depth], np.nan)
+        seen = unwound(np.where(past[:depth], x[:depth], np.nan), turn[lanes])
         structure = learn(seen, t[:depth], bins=None if bins is None else bins[:depth], n_bin=n_bin)
         noise = noise * np.where(relative[lanes], _typical(seen), 1.0)
         if any(rule.k == "scan" for rule in chosen):
             scan_k, _ = extrapolation.scan(seen, time=t[:depth])
-    criteria: Criteria = decide(chosen, structure, noise, scan_k)
+    criteria: Criteria = decide(chosen, structure, noise, scan_k, turn[lanes])
     scale = None
     if structure is not None and structure.scale is not None and bins is not None:
         scale = structure.scale[bins, np.arange(len(lanes))[None, :]]

@@ -17,13 +17,14 @@ v(m) − K²·v(g). At m = g = 1 these are K = ρ₁ and σ²(1 − ρ₁²).
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.validation.motion import SNAP, Motion, times_sigma
+from pse_analysis.validation.motion import SNAP, Motion, shortest
 from pse_analysis.vocabulary import Reason
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +34,7 @@ Ints = npt.NDArray[np.int64]
 CHUNK_SAMPLES = 1 << 20
 """Samples worked on at once; what bounds the memory beside the results."""
 
-_NOWHERE = -9
+_NOWHERE = -9.0
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
@@ -64,28 +65,36 @@ class Chunk:
     backward: Bools | None = None
 
 
-class _Lanes:
-    """Where each channel stands: its reference, the increment that led there, a pending step."""
+class _At(enum.IntEnum):
+    """Columns of the state: the reference, the increment that led there, a pending step."""
 
-    def __init__(self, n: int) -> None:
-        self.value = np.full(n, np.nan)
-        self.time = np.full(n, np.nan)
-        self.row = np.full(n, _NOWHERE)
-        self.lead = np.full(n, np.nan)
-        self.span = np.full(n, np.nan)
-        self.lead_row = np.full(n, _NOWHERE)
-        self.count = np.full(n, -1)
-        self.step_value = np.full(n, np.nan)
-        self.step_time = np.full(n, np.nan)
+    VALUE = 0
+    TIME = 1
+    ROW = 2
+    LEAD = 3
+    SPAN = 4
+    LEAD_ROW = 5
+    COUNT = 6
+    STEP_VALUE = 7
+    STEP_TIME = 8
 
-    def ordinary(self, lane: Ints, row: Ints | int) -> Bools:
-        """Whether the two rows before ``row`` are the reference and its predecessor."""
-        return np.asarray(
-            (self.row[lane] == row - 1)
-            & (self.lead_row[lane] == row - 2)
-            & (self.span[lane] == 1.0)
-            & (self.count[lane] < 0)
-        )
+
+def _unknown(n_channel: int) -> Array:
+    """State of channels that have had no sample, (n_channel, 9)."""
+    state = np.full((n_channel, len(_At)), np.nan)
+    state[:, [_At.ROW, _At.LEAD_ROW]] = _NOWHERE
+    state[:, _At.COUNT] = -1.0
+    return state
+
+
+def _ordinary(state: Array, row: Ints | float) -> Bools:
+    """Whether the two rows before ``row`` are the reference and its predecessor."""
+    return np.asarray(
+        (state[:, _At.ROW] == row - 1)
+        & (state[:, _At.LEAD_ROW] == row - 2)
+        & (state[:, _At.SPAN] == 1.0)
+        & (state[:, _At.COUNT] < 0.0)
+    )
 
 
 @dataclass(eq=False)
@@ -101,22 +110,33 @@ class Walk:
 
     motion: Motion
     n_row: Ints | None = None
-    _lanes: _Lanes = field(init=False)
+    _state: Array = field(init=False)
     _row: int = field(init=False, default=0)
     _last_time: Array | None = field(init=False, default=None)
-    _scratch: tuple[Array, Array, Array, Bools] | None = field(init=False, default=None)
+    _whole: bool = field(init=False, default=True)
+    _scratch: tuple[Array, Array, Bools] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         motion = self.motion
-        self._lanes = _Lanes(len(motion.k))
+        self._state = _unknown(len(motion.k))
         self._extrapolates = np.isfinite(motion.extrapolation)
         self._both = self._extrapolates & np.isfinite(motion.increment)
         self._gamma = np.where(
             self._extrapolates, motion.extrapolation_threshold, motion.increment_threshold
         )
         self._k = np.where(self._extrapolates, motion.k, 0.0)
-        self._floor = motion.one_step_variance
-        self._agreement = np.minimum(motion.increment, motion.extrapolation)
+        agreement = np.minimum(motion.increment, motion.extrapolation)
+        self._limits = np.column_stack(
+            [
+                motion.increment,
+                motion.extrapolation,
+                self._k,
+                motion.one_step_variance,
+                agreement,
+                motion.confirm,
+            ]
+        )
+        self._turns = bool(np.isfinite(motion.turn).any())
         # v(n) and its slope to the right of each lag; past the last one it never falls.
         self._n_lag = motion.structure.shape[1] - 1
         self._v = np.ascontiguousarray(motion.structure).ravel()
@@ -127,18 +147,17 @@ class Walk:
         """Buffer for the samples of the next chunk, (n, n_channel), NaN where ruled out."""
         return self._work(n)[0][2:]
 
-    def _work(self, n: int) -> tuple[Array, Array, Array, Bools]:
+    def _work(self, n: int) -> tuple[Array, Array, Bools]:
         # Fresh arrays of this size would cost a page fault every 512 samples.
         if self._scratch is None or len(self._scratch[1]) <= n:
             width = len(self.motion.k)
             self._scratch = (
                 np.empty((n + 2, width)),
                 np.empty((n + 1, width)),
-                np.empty((n, width)),
                 np.empty((n, width), dtype=bool),
             )
-        extended, change, score, fine = self._scratch
-        return extended[: n + 2], change[: n + 1], score[:n], fine[:n]
+        extended, change, fine = self._scratch
+        return extended[: n + 2], change[: n + 1], fine[:n]
 
     def step(self, chunk: Chunk) -> None:
         """Advance over a chunk, whose values stand in `samples`, and write what is found."""
@@ -147,12 +166,12 @@ class Walk:
             return
         extended = self._work(n)[0]
         # Two rows of halo carry the references of ordinary channels into this chunk.
-        lanes = self._lanes
-        ordinary = lanes.ordinary(np.arange(n_channel), self._row)
-        extended[1] = np.where(ordinary, lanes.value, np.nan)
-        extended[0] = np.where(ordinary, lanes.value - lanes.lead, np.nan)
-        with np.errstate(over="ignore", invalid="ignore"):
-            fine = self._sieve(chunk, extended, np.where(ordinary, lanes.lead, np.nan))
+        ordinary = _ordinary(self._state, self._row)
+        value, lead = self._state[:, _At.VALUE], self._state[:, _At.LEAD]
+        extended[1] = np.where(ordinary, value, np.nan)
+        extended[0] = np.where(ordinary, value - lead, np.nan)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            fine = self._sieve(chunk, extended, np.where(ordinary, lead, np.nan))
             self._mark_uneven(fine, chunk.time)
             self._walk(fine, extended, chunk)
         self._row += n
@@ -162,11 +181,12 @@ class Walk:
         """Which samples are inside their threshold if all before them are ordinary."""
         scale = chunk.scale
         limit = self._gamma[None, :] if scale is None else self._gamma * scale
-        _, change, score, fine = self._work(len(chunk.value))
-        if chunk.statistic is not None:
-            score = chunk.statistic
+        _, change, fine = self._work(len(chunk.value))
+        score = np.empty(chunk.value.shape) if chunk.statistic is None else chunk.statistic
         np.subtract(extended[1:], extended[:-1], out=change)
         change[0] = lead
+        for lane in np.flatnonzero(np.isfinite(self.motion.turn)):
+            change[:, lane] = shortest(change[:, lane], self.motion.turn[lane])
         naive = change[1:]
         # With k = 0 this still spreads a NaN behind, so that "ordinary" means one thing.
         np.multiply(change[:-1], self._k, out=score)
@@ -174,10 +194,10 @@ class Walk:
         np.abs(score, out=score)
         np.less_equal(score, limit, out=fine)
         if self._both.any():
-            second = self.motion.increment_threshold[None, self._both]
-            if scale is not None:
-                second = second * (scale if scale.shape[1] == 1 else scale[:, self._both])
-            fine[:, self._both] &= np.abs(naive[:, self._both]) <= second
+            second = np.where(self._both, self.motion.increment_threshold, np.inf)
+            np.abs(change, out=change)
+            # NaN has been dealt with above; here it must not count as exceeding.
+            fine &= ~(naive > (second if scale is None else second * scale))
         if chunk.threshold is not None:
             chunk.threshold[...] = limit
         return fine
@@ -197,7 +217,6 @@ class Walk:
     def _walk(self, fine: Bools, extended: Array, chunk: Chunk) -> None:
         """Walk every channel from each sample that is not fine until it is ordinary again."""
         n, n_channel = chunk.value.shape
-        lanes = self._lanes
         stop = np.full(n_channel, n)
         if self.n_row is not None:
             stop = np.clip(self.n_row - self._row, 0, n)
@@ -208,15 +227,17 @@ class Walk:
         row = _next_event(events, lane, np.zeros(n_channel, dtype=np.int64), n)
         later = row > 0
         self._enter(lane[later], row[later], extended, chunk.time)
+        whole = bool(np.all(np.rint(chunk.time) == chunk.time)) and self._whole
+        self._whole = whole
         while True:
             alive = row < stop[lane]
             if not alive.all():
                 lane, row = lane[alive], row[alive]
             if not len(lane):
                 return
-            self._decide(lane, row, chunk)
+            state = self._decide(lane, row, chunk, whole)
             row = row + 1
-            calm = np.flatnonzero(lanes.ordinary(lane, row + self._row))
+            calm = np.flatnonzero(_ordinary(state, row + self._row))
             if len(calm):
                 ahead = _next_event(events, lane[calm], row[calm], n)
                 jumps = ahead > row[calm]
@@ -228,158 +249,162 @@ class Walk:
         """Set the state of channels that reach ``row`` in the ordinary way."""
         if not len(lane):
             return
-        lanes = self._lanes
-        value, before = extended[row + 1, lane], extended[row, lane]
-        lanes.value[lane] = value
-        lanes.lead[lane] = value - before
-        lanes.time[lane] = _at(time, row - 1, lane)
-        lanes.row[lane] = row - 1 + self._row
-        lanes.lead_row[lane] = row - 2 + self._row
-        lanes.span[lane] = 1.0
-        lanes.count[lane] = -1
+        state = np.empty((len(lane), len(_At)))
+        state[:, _At.VALUE] = extended[row + 1, lane]
+        state[:, _At.LEAD] = self._shortest(lane, state[:, _At.VALUE] - extended[row, lane])
+        state[:, _At.TIME] = _at(time, row - 1, lane)
+        state[:, _At.ROW] = row - 1 + self._row
+        state[:, _At.LEAD_ROW] = row - 2 + self._row
+        state[:, _At.SPAN] = 1.0
+        state[:, _At.COUNT] = -1.0
+        self._state[lane] = state
 
-    def _decide(self, lane: Ints, row: Ints, chunk: Chunk) -> None:
-        """Decide one sample of each given channel and move the channel's state past it."""
-        lanes, motion = self._lanes, self.motion
+    def _decide(self, lane: Ints, row: Ints, chunk: Chunk, whole: bool) -> Array:
+        """Decide one sample of each given channel; the channels' state after it."""
+        state = self._state[lane]
         x = chunk.value[row, lane]
-        present = x == x
-        if not present.all():
-            absent = ~present
+        absent = x != x
+        if absent.any():
             for table in (chunk.statistic, chunk.threshold):
                 if table is not None:
                     table[row[absent], lane[absent]] = np.nan
-            lane, row, x = lane[present], row[present], x[present]
         t = _at(chunk.time, row, lane)
         factor = None if chunk.scale is None else _at(chunk.scale, row, lane)
         older = None if chunk.backward is None else _at(chunk.backward, row, lane)
+        increment, extrapolation, k, floor, agreement, confirm = self._limits[lane].T
 
-        reference = lanes.value[lane]
-        change = x - reference
-        elapsed = _snapped(np.abs(t - lanes.time[lane]))
-        variance = self._variance(lane, elapsed)
-        predicted, error = self._extrapolate(lane, elapsed, variance, older)
+        reference = state[:, _At.VALUE]
+        change = self._shortest(lane, x - reference)
+        elapsed = np.abs(t - state[:, _At.TIME])
+        elapsed = elapsed if whole else _snapped(elapsed)
+        predicted, error, variance = self._extrapolate(lane, state, elapsed, k, floor, older)
+        moved = np.abs(change)
         surprise = np.abs(change - predicted)
-        plain = times_sigma(motion.increment[lane], np.sqrt(variance))
-        sharp = times_sigma(motion.extrapolation[lane], np.sqrt(error))
+        # A check that is not made has no finite threshold, and NaN is exceeded by nothing: neither
+        # by a sample that is absent nor by the first one, which has no reference.
+        plain = increment * np.sqrt(variance)
+        sharp = extrapolation * np.sqrt(error)
         if factor is not None:
             plain, sharp = plain * factor, sharp * factor
-        # Without a reference the change is NaN, which exceeds nothing: the first sample is taken.
-        over_increment = np.abs(change) > plain
+        over_increment = moved > plain
         over_extrapolation = surprise > sharp
         flagged = over_increment | over_extrapolation
 
-        accepted, count, waited = self._confirm(lane, x, t, factor, flagged, older)
         bits = over_increment * np.int32(Reason.INCREMENT)
         bits += over_extrapolation * np.int32(Reason.EXTRAPOLATION)
-        bits[accepted] = np.int32(Reason.STEP_ACCEPTED)
+        moves = ~(flagged | absent)
+        waits = flagged
+        if older is not None:
+            moves, waits = moves & ~older, flagged & ~older
+        if waits.any():
+            accepted = self._confirm(
+                lane, state, x, t, factor, waits, agreement, floor, confirm, whole
+            )
+            bits[accepted] = np.int32(Reason.STEP_ACCEPTED)
         chunk.reasons[row, lane] |= bits
-        by_extrapolation = self._extrapolates[lane] & (over_extrapolation | ~over_increment)
-        if chunk.statistic is not None:
-            chunk.statistic[row, lane] = np.where(by_extrapolation, surprise, np.abs(change))
-        if chunk.threshold is not None:
-            limit = np.where(by_extrapolation, sharp, plain)
-            limit[reference != reference] = np.nan
-            chunk.threshold[row, lane] = limit
-        self._move(lane, row, x, t, change, elapsed, flagged, accepted, count, waited, older)
+        if chunk.statistic is not None or chunk.threshold is not None:
+            by_extrapolation = self._extrapolates[lane] & (over_extrapolation | ~over_increment)
+            if chunk.statistic is not None:
+                chunk.statistic[row, lane] = np.where(by_extrapolation, surprise, moved)
+            if chunk.threshold is not None:
+                limit = np.where(by_extrapolation, sharp, plain)
+                limit[change != change] = np.nan
+                chunk.threshold[row, lane] = limit
+
+        # Good samples become the reference.
+        np.copyto(state[:, _At.LEAD_ROW], state[:, _At.ROW], where=moves)
+        np.copyto(state[:, _At.ROW], row + float(self._row), where=moves)
+        np.copyto(state[:, _At.VALUE], x, where=moves)
+        np.copyto(state[:, _At.TIME], t, where=moves)
+        np.copyto(state[:, _At.LEAD], change, where=moves)
+        np.copyto(state[:, _At.SPAN], elapsed, where=moves)
+        np.copyto(state[:, _At.COUNT], -1.0, where=moves)
+        if waits.any():
+            step = np.flatnonzero(accepted)
+            state[step, _At.VALUE], state[step, _At.TIME] = x[step], t[step]
+            state[step, _At.ROW], state[step, _At.LEAD_ROW] = row[step] + self._row, _NOWHERE
+        self._state[lane] = state
+        return state
 
     def _confirm(
         self,
         lane: Ints,
+        state: Array,
         x: Array,
         t: Array,
         factor: Array | None,
-        flagged: Bools,
-        older: Bools | None,
-    ) -> tuple[Bools, Ints, Array]:
-        """Whether a flagged sample confirms a step: a level that flagged samples share."""
-        lanes = self._lanes
+        waits: Bools,
+        agreement: Array,
+        floor: Array,
+        confirm: Array,
+        whole: bool,
+    ) -> Bools:
+        """Whether flagged samples confirm a step, a level that flagged ones share; keeps count."""
         accepted = np.zeros(len(lane), dtype=bool)
-        count = np.zeros(len(lane), dtype=np.int64)
-        waited = np.ones(len(lane))
-        asks = flagged & (lanes.count[lane] >= 0)
-        if older is not None:
-            asks &= ~older
-        which = np.flatnonzero(asks)
-        if len(which):
-            at = lane[which]
-            wait = _snapped(np.abs(t[which] - lanes.step_time[at]))
-            near = times_sigma(self._agreement[at], np.sqrt(self._variance(at, wait)))
-            if factor is not None:
-                near = near * factor[which]
-            agrees = np.abs(x[which] - lanes.step_value[at]) <= near
-            count[which] = np.where(agrees, lanes.count[at] + 1, 0)
-            accepted[which] = agrees & (count[which] >= self.motion.confirm[at])
-            waited[which] = wait
-        return accepted, count, waited
+        which = np.flatnonzero(waits)
+        now, when = x[which], t[which]
+        waited = np.abs(when - state[which, _At.STEP_TIME])
+        waited = waited if whole else _snapped(waited)
+        near = agreement[which] * np.sqrt(self._variance(lane[which], waited, floor[which]))
+        if factor is not None:
+            near = near * factor[which]
+        led = self._shortest(lane[which], now - state[which, _At.STEP_VALUE])
+        before = state[which, _At.COUNT]
+        agrees = (before >= 0.0) & (np.abs(led) <= near)
+        count = np.where(agrees, before + 1.0, 0.0)
+        enough = agrees & (count >= confirm[which])
+        accepted[which] = enough
+        state[which, _At.COUNT] = np.where(enough, -1.0, count)
+        state[which, _At.STEP_VALUE] = now
+        state[which, _At.STEP_TIME] = when
+        state[which, _At.LEAD] = np.where(enough, led, state[which, _At.LEAD])
+        state[which, _At.SPAN] = np.where(enough, waited, state[which, _At.SPAN])
+        return accepted
 
-    def _move(
-        self,
-        lane: Ints,
-        row: Ints,
-        x: Array,
-        t: Array,
-        change: Array,
-        elapsed: Array,
-        flagged: Bools,
-        accepted: Bools,
-        count: Ints,
-        waited: Array,
-        older: Bools | None,
-    ) -> None:
-        """Good samples become the reference, flagged ones the level a step might have."""
-        lanes = self._lanes
-        moves, waits = ~flagged | accepted, flagged & ~accepted
-        if older is not None:
-            moves, waits = moves & ~older, waits & ~older
-        if accepted.any():
-            change = np.where(accepted, x - lanes.step_value[lane], change)
-            elapsed = np.where(accepted, waited, elapsed)
-        at = lane[moves]
-        lanes.lead_row[at] = np.where(accepted[moves], _NOWHERE, lanes.row[at])
-        lanes.value[at] = x[moves]
-        lanes.time[at] = t[moves]
-        lanes.row[at] = row[moves] + self._row
-        lanes.lead[at] = change[moves]
-        lanes.span[at] = elapsed[moves]
-        lanes.count[at] = -1
-        at = lane[waits]
-        lanes.count[at] = count[waits]
-        lanes.step_value[at] = x[waits]
-        lanes.step_time[at] = t[waits]
+    def _shortest(self, lane: Ints, change: Array) -> Array:
+        return shortest(change, self.motion.turn[lane]) if self._turns else change
 
-    def _variance(self, lane: Ints, periods: Array) -> Array:
+    def _variance(self, lane: Ints, periods: Array, floor: Array) -> Array:
         """v(n) at real n ≥ 1, linear between whole lags and beyond the last; (n,) [unit²]."""
         n = np.fmax(periods, 1.0)
-        np.minimum(n, 1e12, out=n)
         low = np.minimum(n, self._n_lag).astype(np.int64)
         index = lane * (self._n_lag + 1) + low
         v = self._v[index] + (n - low) * self._rise[index]
         # Estimated v(n) may dip; over a gap nothing becomes more certain than over one period.
-        return np.asarray(np.maximum(v, self._floor[lane]))
+        return np.asarray(np.maximum(v, floor))
 
     def _extrapolate(
-        self, lane: Ints, elapsed: Array, variance: Array, older: Bools | None
-    ) -> tuple[Array, Array]:
-        """Predicted change since the reference and the variance of its error; both (n,)."""
-        lanes = self._lanes
-        k_one = self._k[lane]
-        lead, span = lanes.lead[lane], lanes.span[lane]
+        self,
+        lane: Ints,
+        state: Array,
+        elapsed: Array,
+        k_one: Array,
+        floor: Array,
+        older: Bools | None,
+    ) -> tuple[Array | float, Array, Array]:
+        """Predicted change since the reference, the variance of its error, and v(elapsed)."""
+        lead, span = state[:, _At.LEAD], state[:, _At.SPAN]
         usable = (k_one != 0.0) & (lead == lead)
         if older is not None:
             usable &= ~older
         if not usable.any():
-            return np.zeros(len(lane)), variance
-        floor = self._floor[lane]
-        v_span = self._variance(lane, span)
-        covariance = 0.5 * (self._variance(lane, elapsed + span) - variance - v_span)
-        with np.errstate(divide="ignore"):
-            k = np.where(v_span > 0.0, covariance / v_span, 0.0)
+            variance = self._variance(lane, elapsed, floor)
+            return 0.0, variance, variance
+        n = len(lane)
+        three = self._variance(
+            np.concatenate([lane, lane, lane]),
+            np.concatenate([elapsed, span, elapsed + span]),
+            np.concatenate([floor, floor, floor]),
+        )
+        variance, v_span, v_both = three[:n], three[n : 2 * n], three[2 * n :]
+        # v(span) is 0 only where nothing ever changes; k is then of no account.
+        k = 0.5 * (v_both - variance - v_span) / np.where(v_span > 0.0, v_span, np.inf)
         one = (elapsed == 1.0) & (span == 1.0)
         k = np.where(one, k_one, k)
         error = np.where(one, floor, np.maximum(variance - k * k * v_span, floor))
         # Within less than a period only part of the predicted change can have happened.
         predicted = k * lead * np.minimum(elapsed, 1.0)
-        return np.where(usable, predicted, 0.0), np.where(usable, error, variance)
+        return np.where(usable, predicted, 0.0), np.where(usable, error, variance), variance
 
 
 def _at(table: npt.NDArray[_Scalar], row: Ints, lane: Ints) -> npt.NDArray[_Scalar]:
