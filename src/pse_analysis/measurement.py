@@ -481,6 +481,10 @@ class RectangularModel:
         self._partner = _partners(layout)
         self._across = np.isin(layout.quantity, (VA, IA, Q))
 
+    def paired(self, available: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Rows that are available together with the other half of their phasor or power. (m,)"""
+        return np.asarray((self._partner >= 0) & available & available[self._partner])
+
     def rows(
         self,
         z: FloatArray,
@@ -507,8 +511,7 @@ class RectangularModel:
         """
         quantity = self.layout.quantity
         predicted = self._functional @ voltage
-        partner, paired = self._partner, self._partner >= 0
-        paired &= available & available[partner]
+        partner, paired = self._partner, self.paired(available)
         angle, size = np.angle(predicted), np.abs(predicted)
         is_angle = (quantity == VA) | (quantity == IA)
         is_size = (quantity == VM) | (quantity == IM)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -258,3 +260,26 @@ def test_normalised_residuals_have_unit_variance() -> None:
     # A row that alone fixes a state has next to no residual; the rest are standard normal.
     ratio = np.array(white).std(axis=0)
     assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * 200)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_few_voltage_phasors_and_current_phasors_suffice_from_a_flat_start(grid: str) -> None:
+    network = library.load(grid)
+    branch = np.flatnonzero(network.branches.in_service)
+    layout = SensorLayout.of(
+        network,
+        *[(q, np.array([0, network.n_bus // 2]), BUS) for q in (VM, VA)],
+        *[(q, branch, FROM) for q in (IM, IA)],
+    )
+    names = tuple(
+        f"d{p}.{s}:{q}"
+        for p, s, q in zip(layout.position, layout.side, layout.quantity, strict=True)
+    )
+    layout = dataclasses.replace(layout, channel=names)
+    rng = np.random.default_rng(SEED)
+    truth = solve(network).x
+    sigma = np.full(len(layout), 1e-4)
+    z = MeasurementModel(network, layout).h(truth) + sigma * rng.normal(size=len(sigma))
+    solution = WeightedLeastSquares(network, layout).solve(z, sigma)
+    assert solution.converged
+    assert np.abs(solution.x - truth).max() < 0.02

@@ -16,7 +16,13 @@ from scipy.sparse import linalg as sparse_linalg
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import IA, IM, MeasurementModel, SensorLayout
+from pse_analysis.measurement import (
+    IA,
+    IM,
+    MeasurementModel,
+    RectangularModel,
+    SensorLayout,
+)
 from pse_analysis.vocabulary import Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -182,8 +188,8 @@ class WeightedLeastSquares:
         available : (m,) ndarray of bool, optional
             Rows that carry a value; all of them by default.
         start : (2N,) ndarray, optional
-            [θ; |V|] to start from; flat by default, and then current phasors join after the first
-            iterations only, when there is a current to compare them with.
+            [θ; |V|] to start from; flat by default, or, where currents are measured, the solution
+            of the linear form of the measurements.
 
         Returns
         -------
@@ -201,11 +207,8 @@ class WeightedLeastSquares:
         weight[rows] = 1.0 / sigma[rows]
         observed = np.where(rows, z, 0.0)
         x: FloatArray = self.flat_start() if start is None else start.copy()
-        if start is None and (self._current & rows).any() and (~self._current & rows).any():
-            try:
-                x, _, _ = self._iterate(x, observed, np.where(self._current, 0.0, weight), 1e-2)
-            except Unobservable:
-                x = self.flat_start()
+        if start is None and (self._current & rows).any():
+            x = self._linear_start(observed, sigma, rows)
         try:
             x, iterations, converged = self._iterate(x, observed, weight, self.tolerance)
         except Unobservable as error:
@@ -220,6 +223,31 @@ class WeightedLeastSquares:
             _gain=self._gain,
             _columns=self.model.columns,
         )
+
+    def _linear_start(self, z: FloatArray, sigma: FloatArray, rows: BoolArray) -> FloatArray:
+        """[θ; |V|] by linear least squares from rated voltage, which parts without data keep.
+
+        A current has no tangent in polar coordinates where it vanishes, as it does at rated
+        voltage; in rectangular ones its phasor is linear. Half a phasor is left out.
+        """
+        n = self.network.n_bus
+        linear = RectangularModel(self.network, self.model.layout)
+        H, target, spread = linear.rows(z, sigma, rows, np.ones(n, dtype=np.complex128))
+        read = rows & (~self._current | linear.paired(rows))
+        weight = np.where(read, 1.0 / np.where(read, spread, 1.0), 0.0)
+        whitened = sparse.csr_array(sparse.diags_array(weight) @ H)
+        rated = np.concatenate([np.ones(n), np.zeros(n)])
+        # A prior of σ = 1 p.u. makes the gain regular and moves what is measured next to nothing.
+        gain = sparse.csc_array(whitened.T @ whitened + sparse.eye_array(2 * n))
+        x = rated + sparse_linalg.splu(gain).solve(
+            whitened.T @ (weight * np.where(read, target, 0.0) - whitened @ rated)
+        )
+        voltage = x[:n] + 1j * x[n:]
+        if not self.model.layout.has_angle:
+            voltage = voltage * np.exp(-1j * np.angle(voltage[self.network.slack]))
+        if (np.abs(voltage) < 0.1).any():
+            return self.flat_start()
+        return np.concatenate([np.angle(voltage), np.abs(voltage)])
 
     def _iterate(
         self, x: FloatArray, z: FloatArray, weight: FloatArray, tolerance: float
