@@ -1,0 +1,89 @@
+"""Claim: samples of another time enter as in a textbook filter whose state holds the past."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from reference import kalman_step
+
+from pse_analysis.estimation.estimator import Snapshot
+from pse_analysis.estimation.intervals import bridge_covariance, weights
+from pse_analysis.estimation.kalman import kalman_filter
+from pse_analysis.estimation.process import LoadStatistics, load_noise
+from pse_analysis.grid import library
+from pse_analysis.grid.power_flow import solve
+from pse_analysis.measurement import (
+    BUS,
+    VA,
+    VM,
+    MeasurementModel,
+    P,
+    Q,
+    RectangularModel,
+    SensorLayout,
+)
+
+SEED = 5
+STEP_S = 300.0
+
+
+def test_lagged_filter_equals_augmented_textbook_filter() -> None:
+    network = library.load("ieee14")
+    n, bus = network.n_bus, np.arange(network.n_bus)
+    layout = SensorLayout.of(
+        network, (VM, bus[::3], BUS), (VA, bus[::3], BUS), (P, bus, BUS), (Q, bus, BUS)
+    )
+    power = np.isin(layout.quantity, (P, Q))
+    names = tuple(f"d{p}:{q}" for p, q in zip(layout.position, layout.quantity, strict=True))
+    layout = dataclasses.replace(layout, channel=names, window_s=np.where(power, 900.0, 0.0))
+    sigma = np.where(power, 1e-2, 2e-3)
+    nominal = np.abs(np.concatenate([network.p_nominal_pu, network.q_nominal_pu]))
+    statistics = LoadStatistics(0.01 * nominal[None, :] + 1e-4, np.eye(2 * n), 3e-4, 86400.0)
+    noise = load_noise(network, statistics)
+    lags = 4
+    ours = kalman_filter("kf", network, layout, noise, step_s=STEP_S, reach_s=1200.0)
+    linear = RectangularModel(network, layout)
+    exact = MeasurementModel(network, layout).h(solve(network).x)
+    rng = np.random.default_rng(SEED)
+
+    def snapshot(k: int) -> Snapshot:
+        z = exact + sigma * rng.normal(size=len(sigma))
+        age = np.where(power, 120.0, rng.uniform(0, 60, len(sigma)))
+        fresh = ~power | (k % 3 == 0)
+        available = rng.random(len(sigma)) < 0.9 if k else np.ones(len(sigma), dtype=bool)
+        time = np.datetime64("2016-06-09T00:00:00", "us") + k * np.timedelta64(300, "s")
+        return Snapshot(time, z, sigma, np.zeros(len(sigma)), available, fresh, age)
+
+    state, _ = ours.init(snapshot(0))
+    size = 2 * n * (lags + 1)
+    assert state.x.shape == (size,)
+    x, covariance = state.x.copy(), state.P.copy()
+    F = np.eye(size, k=-2 * n)
+    F[: 2 * n, : 2 * n] = np.eye(2 * n)
+    for k in range(1, 13):
+        now = snapshot(k)
+        voltage = x[:n] + 1j * x[n : 2 * n]
+        walk = np.zeros((size, size))
+        walk[: 2 * n, : 2 * n] = noise(voltage, now.time)
+        used = np.flatnonzero(now.available & now.fresh)
+        interval = now.age_s[used], layout.window_s[used], STEP_S, lags
+        share, bridge = weights(*interval), bridge_covariance(*interval)
+        for _ in range(3):
+            H, z, spread = linear.rows(now.z, sigma, now.available & now.fresh, voltage)
+            H = H.toarray()[used]
+            lagged = np.hstack([share[:, [lag]] * H for lag in range(lags + 1)])
+            moved = H @ walk[: 2 * n, : 2 * n] @ H.T
+            R = np.diag(spread[used] ** 2) + bridge * moved
+            after = kalman_step(x, covariance, F, walk, lagged, R, z[used])
+            reached = after[0][:n] + 1j * after[0][n : 2 * n]
+            settled = np.abs(reached - voltage).max() < 1e-3
+            voltage = reached
+            if settled:
+                break
+        x, covariance = after
+        state, info = ours.step(state, now)
+        assert info.used.sum() == len(used)
+        np.testing.assert_allclose(state.x, x, atol=1e-9)
+        np.testing.assert_allclose(state.P, covariance, atol=1e-9)
+    assert np.abs(state.x[: 2 * n] - state.x[-2 * n :]).max() > 1e-4
