@@ -39,7 +39,8 @@ LEAVES = {"drawing": (), "figures": ("drawing",), "recording": ("drawing",)}
 CALLERS_OF_LEAVES = {"pse_analysis.pipeline.stages"}
 # Within a line: the power flow solves the rows of the measurement model, for one.
 WITHIN_LAYER = {("grid", "measurement"), ("measurement", "grid"), ("telemetry", "grid"),
-                ("telemetry", "measurement"), ("vocabulary", "parameters")}  # fmt: skip
+                ("telemetry", "measurement"), ("telemetry", "machine"), ("measurement", "machine"),
+                ("vocabulary", "parameters")}  # fmt: skip
 
 
 def imported(module: str) -> set[str]:

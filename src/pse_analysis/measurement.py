@@ -20,14 +20,18 @@ from scipy import sparse
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
+from pse_analysis.machine import Machine
 from pse_analysis.vocabulary import UNITS, Aggregation, Quantity, SigmaKind
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
+Model = Network | Machine
+"""What a case is about: its channels measure a grid, or a machine."""
+
 QUANTITIES = tuple(Quantity)
-VM, VA, P, Q, IM, IA = range(6)
+VM, VA, P, Q, IM, IA, DELTA_M, ROTOR_ANGLE, ROTOR_SPEED = range(9)
 BUS, FROM, TO = range(3)
 _SIDES = {"": BUS, "from": FROM, "to": TO}
 
@@ -94,8 +98,8 @@ class SensorLayout:
         return len(self.channel)
 
     @classmethod
-    def from_channels(cls, channels: pd.DataFrame, network: Network) -> SensorLayout:
-        """Layout of a channels table.
+    def from_channels(cls, channels: pd.DataFrame, model: Model) -> SensorLayout:
+        """Layout of a channels table; a machine's quantities are per unit and rad already.
 
         Raises
         ------
@@ -104,6 +108,9 @@ class SensorLayout:
         TableError
             If a unit does not fit its quantity, or a side its element.
         """
+        if isinstance(model, Machine):
+            return cls._of_machine(channels, model)
+        network = model
         names = tuple(channels["channel"])
         m = len(names)
         quantity, position, side = (np.zeros(m, dtype=np.int64) for _ in range(3))
@@ -147,6 +154,38 @@ class SensorLayout:
             scale=factor * channels["sign"].to_numpy(dtype=float),
             sigma=np.where(relative, 1.0, factor) * channels["sigma"].to_numpy(dtype=float),
             relative=relative,
+            window_s=np.where(
+                channels["aggregation"] == Aggregation.MEAN,
+                channels["period_s"].to_numpy(dtype=float),
+                0.0,
+            ),
+        )
+
+    @classmethod
+    def _of_machine(cls, channels: pd.DataFrame, machine: Machine) -> SensorLayout:
+        m = len(channels)
+        foreign = channels[channels["element"] != machine.element]
+        if len(foreign):
+            raise TableError(
+                f"channels: {foreign['channel'].iloc[0]!r} stands at "
+                f"{foreign['element'].iloc[0]!r}: expected {machine.element!r}"
+            )
+        for channel, q, unit in zip(
+            *(channels[c] for c in ("channel", "quantity", "unit")), strict=True
+        ):
+            if unit not in UNITS[Quantity(q)]:
+                raise TableError(
+                    f"channels: unit {unit!r} of {channel!r} does not fit {q}: expected "
+                    f"{' or '.join(UNITS[Quantity(q)])}"
+                )
+        return cls(
+            channel=tuple(channels["channel"]),
+            quantity=np.array([QUANTITIES.index(Quantity(q)) for q in channels["quantity"]]),
+            position=np.zeros(m, dtype=np.int64),
+            side=np.full(m, BUS, dtype=np.int64),
+            scale=channels["sign"].to_numpy(dtype=float),
+            sigma=channels["sigma"].to_numpy(dtype=float),
+            relative=(channels["sigma_kind"] == SigmaKind.RELATIVE).to_numpy(),
             window_s=np.where(
                 channels["aggregation"] == Aggregation.MEAN,
                 channels["period_s"].to_numpy(dtype=float),

@@ -14,7 +14,7 @@ Glossary
 --------
 case            one study: a TOML file and a folder of raw parquet
 channel         one measured quantity of one sensor, e.g. ``pmu:bus/6:vm_pu``
-element         ``bus/NAME`` or ``branch/NAME``, with NAME as the grid model spells it
+element         ``bus/NAME``, ``branch/NAME`` or ``machine/NAME``, with NAME as the model spells it
 instant         a time at which the state is estimated
 sample          one value of one channel as it arrived
 study window    the instants that are estimated and scored; telemetry before it is *history*
@@ -59,6 +59,9 @@ class Quantity(enum.StrEnum):
     Q_MVAR = "q_mvar"
     I_KA = "i_ka"
     IA_DEGREE = "ia_degree"
+    DELTA_M_PU = "delta_m_pu"
+    ROTOR_ANGLE_RAD = "rotor_angle_rad"
+    ROTOR_SPEED_RAD_S = "rotor_speed_rad_s"
 
 
 class Side(enum.StrEnum):
@@ -168,6 +171,9 @@ UNITS: MappingProxyType[Quantity, tuple[str, ...]] = MappingProxyType(
         Quantity.Q_MVAR: ("mvar", "kvar", "pu"),
         Quantity.I_KA: ("ka", "a", "pu"),
         Quantity.IA_DEGREE: ("degree", "rad"),
+        Quantity.DELTA_M_PU: ("pu",),
+        Quantity.ROTOR_ANGLE_RAD: ("rad",),
+        Quantity.ROTOR_SPEED_RAD_S: ("rad/s",),
     }
 )
 """Units a channel of each quantity may be given in; the first is the one its name carries."""
@@ -262,7 +268,7 @@ def schema(table: str) -> pa.DataFrameSchema:
             "channel": col(str),
             "source": col(str, one_of(Source)),
             "quantity": col(str, one_of(Quantity)),
-            "element": col(str, pa.Check.str_matches(r"^(bus|branch)/.+")),
+            "element": col(str, pa.Check.str_matches(r"^(bus|branch|machine)/.+")),
             "side": col(str, one_of(Side)),
             "unit": col(str),
             "sigma": col("float64", pa.Check.gt(0)),

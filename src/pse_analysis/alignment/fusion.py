@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import TableError
-from pse_analysis.grid.network import Network
-from pse_analysis.measurement import IA, VA, SensorLayout, standard_deviation, wrap
+from pse_analysis.measurement import IA, VA, Model, SensorLayout, standard_deviation, wrap
 from pse_analysis.parameters import Study
 from pse_analysis.vocabulary import Origin, check, usable
 
@@ -48,7 +47,7 @@ class AlignParams:
 def align(
     validated: pd.DataFrame,
     channels: pd.DataFrame,
-    network: Network,
+    model: Model,
     study: Study,
     params: AlignParams | None = None,
 ) -> pd.DataFrame:
@@ -60,7 +59,8 @@ def align(
         Table ``validated``.
     channels : DataFrame
         Table ``channels``.
-    network : Network
+    model : Network or Machine
+        What the channels measure.
     study : Study
         Instants reach from ``history_start`` to ``end``.
     params : AlignParams, optional
@@ -83,7 +83,7 @@ def align(
     consecutive samples before the study, so nothing after an instant is known at it.
     """
     params = params or AlignParams()
-    layout = SensorLayout.from_channels(channels, network)
+    layout = SensorLayout.from_channels(channels, model)
     column = pd.Index(layout.channel).get_indexer(validated["channel"])
     if (column < 0).any():
         name = validated["channel"].iloc[int(np.argmin(column))]
@@ -162,9 +162,7 @@ def _microseconds(times: pd.Series) -> IntArray:
     return np.asarray(naive.to_numpy().astype("datetime64[us]").astype(np.int64))
 
 
-def _usable_in_order(
-    validated: pd.DataFrame, column: IntArray, layout: SensorLayout
-) -> _Samples:
+def _usable_in_order(validated: pd.DataFrame, column: IntArray, layout: SensorLayout) -> _Samples:
     """Usable samples, in per unit, that are not older than one which arrived before them."""
     value = validated["corrected"].to_numpy(dtype=float) * layout.scale[column]
     keep = usable(validated["flag"].to_numpy()) & np.isfinite(value)

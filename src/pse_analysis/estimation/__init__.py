@@ -1,4 +1,4 @@
-"""Estimators: from aligned telemetry to voltages with their covariance."""
+"""Estimators: from aligned telemetry to states with their covariance."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from pse_analysis.errors import TableError
-from pse_analysis.estimation import process
-from pse_analysis.estimation.estimator import Estimated, Estimator, Record, record, run
+from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.estimation import machine, process
+from pse_analysis.estimation.estimator import Estimated, Estimator, Record, States, record, run
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.wls import tracking_wls
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import SensorLayout
+from pse_analysis.machine import Machine
+from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.vocabulary import check
 
@@ -29,7 +30,8 @@ class Method:
     ----------
     name : str
         Spelling in tables and figures.
-    filter : {"wls", "kalman"}
+    filter : {"wls", "kalman", "observer"}
+        ``observer`` is a machine's, the others are a grid's.
     noise : {"load", "scalar"}
         Process noise of a filter.
     variance : float
@@ -37,16 +39,26 @@ class Method:
     source_sigma : float, optional
         σ of the source voltage's change per step for ``load`` noise; learnt from history if not
         given. [p.u.]
+    observer : ObserverParams, optional
+        What an ``observer`` is designed from.
     variant : str
         The aligned variant it reads.
     """
 
     name: str
-    filter: Literal["wls", "kalman"]
+    filter: Literal["wls", "kalman", "observer"]
     noise: Literal["load", "scalar"] = "load"
     variance: float = 1e-6
     source_sigma: float | None = None
+    observer: machine.ObserverParams | None = None
     variant: str = "last"
+
+    def __post_init__(self) -> None:
+        if (self.filter == "observer") != (self.observer is not None):
+            raise ParameterError(
+                f'[estimate.methods] {self.name!r}: filter = "observer" and a table observer = '
+                "{ q = […], r = … } or { poles = […] } belong together"
+            )
 
 
 @dataclass(frozen=True)
@@ -69,7 +81,16 @@ def build(
     study : Study
     history : Record
         Aligned telemetry before the study.
+
+    Raises
+    ------
+    ParameterError
+        If the method is one of a machine.
     """
+    if method.filter == "observer":
+        raise ParameterError(
+            f"method {method.name!r} observes a machine, but the case has a grid: use wls or kalman"
+        )
     if method.filter == "wls":
         return tracking_wls(method.name, network, layout)
     noise = (
@@ -107,7 +128,7 @@ def _reach(history: Record, layout: SensorLayout, step_s: float) -> float:
 def estimate(
     aligned: pd.DataFrame,
     channels: pd.DataFrame,
-    network: Network,
+    model: Model,
     study: Study,
     method: Method,
     *,
@@ -122,7 +143,7 @@ def estimate(
         Table ``aligned``; rows of other trials and variants are passed over.
     channels : DataFrame
         Table ``channels``.
-    network : Network
+    model : Network or Machine
     study : Study
         Instants to estimate; earlier rows are history.
     method : Method
@@ -146,13 +167,18 @@ def estimate(
             f"aligned table does not have: it has variants {sorted(set(aligned['variant']))} and "
             f"trials {sorted(set(aligned['trial']))}"
         )
-    layout = SensorLayout.from_channels(channels, network)
+    layout = SensorLayout.from_channels(channels, model)
     whole = record(rows, layout)
     start = pd.Timestamp(study.start).tz_convert("UTC").tz_localize(None).to_datetime64()
-    estimator = build(method, network, layout, study, whole.between(None, start))
     studied = whole.between(start, None)
-    reference = None if truth is None else true_states(truth, network, studied.time, trial)
-    result = run(estimator, studied.snapshots(), network, layout, trial=trial, truth=reference)
+    if isinstance(model, Machine):
+        estimator = _build_observer(method, model, study)
+        snapshots, layout = machine.snapshots(studied, layout, model)
+    else:
+        estimator = build(method, model, layout, study, whole.between(None, start))
+        snapshots = studied.snapshots()
+    reference = None if truth is None else true_states(truth, model, studied.time, trial)
+    result = run(estimator, snapshots, model, layout, trial=trial, truth=reference)
     return Estimated(
         check("estimated", result.estimated),
         check("residuals", result.residuals),
@@ -160,30 +186,37 @@ def estimate(
     )
 
 
-def true_states(truth: pd.DataFrame, network: Network, times: np.ndarray, trial: int) -> np.ndarray:
-    """True [θ; |V|] at given instants from the truth table, NaN where it says nothing.
+def _build_observer(method: Method, model: Machine, study: Study) -> Estimator:
+    if method.observer is None:
+        raise ParameterError(
+            f"method {method.name!r} is {method.filter!r}, a grid's, but the case is about "
+            f'{model.element}: use filter = "observer"'
+        )
+    return machine.from_params(method.name, model, method.observer, study.step_s)
+
+
+def true_states(truth: pd.DataFrame, model: Model, times: np.ndarray, trial: int) -> np.ndarray:
+    """True states at given instants from the truth table, NaN where it says nothing.
 
     Parameters
     ----------
     truth : DataFrame
-    network : Network
+    model : Network or Machine
     times : (T,) ndarray of datetime64
     trial : int
 
     Returns
     -------
-    (T, 2N) ndarray
-        [rad, p.u.]
+    (T, n) ndarray
+        [θ; |V|] of a grid [rad, p.u.], [θ; ω] of a machine [rad, rad/s].
     """
-    rows = truth[(truth["trial"] == trial) & truth["quantity"].isin(["va_degree", "vm_pu"])]
-    n = network.n_bus
-    element = pd.Index([f"bus/{name}" for name in network.buses.name])
-    column = element.get_indexer(rows["element"])
-    column = np.where(rows["quantity"] == "vm_pu", column + n, column)
+    states = States.of(model)
+    rows = truth[truth["trial"] == trial]
+    names = pd.MultiIndex.from_arrays([states.element, states.quantity])
+    column = names.get_indexer(pd.MultiIndex.from_frame(rows[["element", "quantity"]]))
     stamps = rows["time_utc"].dt.tz_convert("UTC").dt.tz_localize(None).to_numpy()
     row = pd.Index(times.astype("datetime64[us]")).get_indexer(stamps.astype("datetime64[us]"))
-    out = np.full((len(times), 2 * n), np.nan)
+    out = np.full((len(times), len(states)), np.nan)
     keep = (row >= 0) & (column >= 0)
     out[row[keep], column[keep]] = rows["value"].to_numpy()[keep]
-    out[:, :n] = np.deg2rad(out[:, :n])
-    return out
+    return np.asarray(out / states.factor)

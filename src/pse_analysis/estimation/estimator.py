@@ -2,7 +2,7 @@
 
 An estimator is a record of functions built from a model and frozen parameters. ``init`` makes a
 state from a snapshot, ``step`` carries it to the next one and says what it did, ``read`` turns it
-into voltages with their covariance.
+into an estimate with its covariance: of a grid's voltages, or of a machine's rotor.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import pandas as pd
 from scipy import stats
 
 from pse_analysis.errors import TableError
-from pse_analysis.grid.network import Network
-from pse_analysis.measurement import SensorLayout, wrap
+from pse_analysis.machine import STATES, Machine
+from pse_analysis.measurement import Model, SensorLayout, wrap
 from pse_analysis.vocabulary import Origin, Reason, Status, usable
 
 FloatArray = npt.NDArray[np.float64]
@@ -109,11 +109,58 @@ class Info:
         return cls(status, 0, np.nan, 0, np.zeros(m, dtype=bool), empty, empty, np.zeros(m), detail)
 
 
-class Voltages(NamedTuple):
-    """An estimate in polar form: [θ; |V|] (2N,) and its covariance (2N, 2N). [rad, p.u.]"""
+class Estimate(NamedTuple):
+    """Estimate x (n,) with its covariance (n, n); what the entries are follows from the model.
+
+    A grid's are [θ; |V|] (2N,) [rad, p.u.], a machine's [θ; ω] (2,) [rad, rad/s].
+    """
 
     x: FloatArray
     covariance: FloatArray
+
+
+Voltages = Estimate
+"""An estimate of a grid in polar form."""
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """What the entries of a model's estimate are called in tables.
+
+    Attributes
+    ----------
+    element, quantity : (n,) ndarray of str
+    factor : (n,) ndarray
+        Reported value over the estimate's own.
+    folded : (n,) ndarray of bool
+        Angles that are known up to full turns.
+    """
+
+    element: npt.NDArray[np.object_]
+    quantity: npt.NDArray[np.object_]
+    factor: FloatArray
+    folded: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.factor)
+
+    @classmethod
+    def of(cls, model: Model) -> States:
+        """States of a grid or a machine."""
+        if isinstance(model, Machine):
+            return cls(
+                np.array([model.element] * len(STATES), dtype=object),
+                np.array(STATES, dtype=object),
+                np.ones(len(STATES)),
+                np.zeros(len(STATES), dtype=bool),
+            )
+        n = model.n_bus
+        return cls(
+            np.array([f"bus/{name}" for name in model.buses.name] * 2, dtype=object),
+            np.array(["va_degree"] * n + ["vm_pu"] * n, dtype=object),
+            np.concatenate([np.full(n, 180.0 / np.pi), np.ones(n)]),
+            np.arange(2 * n) < n,
+        )
 
 
 class Estimator(NamedTuple):
@@ -122,7 +169,7 @@ class Estimator(NamedTuple):
     name: str
     init: Callable[[Snapshot], tuple[Any, Info]]
     step: Callable[[Any, Snapshot], tuple[Any, Info]]
-    read: Callable[[Any], Voltages | None]
+    read: Callable[[Any], Estimate | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +279,7 @@ class _Trace:
 def run(
     estimator: Estimator,
     snapshots: Iterator[Snapshot],
-    network: Network,
+    model: Model,
     layout: SensorLayout,
     *,
     trial: int = 0,
@@ -244,11 +291,11 @@ def run(
     ----------
     estimator : Estimator
     snapshots : iterator of Snapshot
-    network : Network
+    model : Network or Machine
     layout : SensorLayout
     trial : int
-    truth : (T, 2N) ndarray, optional
-        True [θ; |V|] at the instants, for NEES. [rad, p.u.]
+    truth : (T, n) ndarray, optional
+        True states at the instants, for NEES: [θ; |V|] [rad, p.u.], or [θ; ω] [rad, rad/s].
 
     Returns
     -------
@@ -256,39 +303,40 @@ def run(
     """
     trace = _Trace()
     state: Any = None
-    nothing = np.full(2 * network.n_bus, np.nan)
+    states = States.of(model)
+    nothing = np.full(len(states), np.nan)
     for k, snapshot in enumerate(snapshots):
         begun = time.perf_counter()
         state, info = estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
         seconds = time.perf_counter() - begun
-        voltages = None if state is None else estimator.read(state)
-        if voltages is not None and not np.isfinite(voltages.x).all():
-            voltages, state = None, None
+        estimate = None if state is None else estimator.read(state)
+        if estimate is not None and not np.isfinite(estimate.x).all():
+            estimate, state = None, None
             info = Info.nothing(
                 len(layout), Status.DIVERGED, "the state is not finite: it restarts next instant"
             )
         trace.time.append(snapshot.time)
         trace.info.append(info)
         trace.seconds.append(seconds)
-        trace.x.append(nothing if voltages is None else voltages.x)
+        trace.x.append(nothing if estimate is None else estimate.x)
         trace.sigma.append(
             nothing
-            if voltages is None
-            else np.sqrt(np.maximum(np.diagonal(voltages.covariance), 0.0))
+            if estimate is None
+            else np.sqrt(np.maximum(np.diagonal(estimate.covariance), 0.0))
         )
         reference = None if truth is None else truth[k]
-        trace.nees.append(_nees(voltages, reference, network.n_bus))
-    return _tables(estimator.name, trial, trace, network, layout)
+        trace.nees.append(_nees(estimate, reference, states.folded))
+    return _tables(estimator.name, trial, trace, states, layout)
 
 
-def _nees(voltages: Voltages | None, truth: FloatArray | None, n_bus: int) -> float:
-    if voltages is None or truth is None or not np.isfinite(truth).all():
+def _nees(estimate: Estimate | None, truth: FloatArray | None, folded: BoolArray) -> float:
+    if estimate is None or truth is None or not np.isfinite(truth).all():
         return float("nan")
-    error = voltages.x - truth
-    error[:n_bus] = wrap(error[:n_bus])
-    deviation = np.sqrt(np.diagonal(voltages.covariance))
+    error = estimate.x - truth
+    error[folded] = wrap(error[folded])
+    deviation = np.sqrt(np.diagonal(estimate.covariance))
     free = deviation > 1e-12
-    scaled = voltages.covariance[np.ix_(free, free)] / np.outer(deviation[free], deviation[free])
+    scaled = estimate.covariance[np.ix_(free, free)] / np.outer(deviation[free], deviation[free])
     try:
         factor = np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
@@ -311,10 +359,10 @@ def _consistent(nis: FloatArray, dof: npt.NDArray[np.int64]) -> BoolArray:
 
 
 def _tables(
-    method: str, trial: int, trace: _Trace, network: Network, layout: SensorLayout
+    method: str, trial: int, trace: _Trace, states: States, layout: SensorLayout
 ) -> Estimated:
     times = pd.DatetimeIndex(np.asarray(trace.time, dtype="datetime64[us]"), tz="UTC")
-    count, n = len(times), network.n_bus
+    count, n = len(times), len(states)
     nis = np.array([i.nis for i in trace.info])
     dof = np.array([i.dof for i in trace.info], dtype=np.int64)
     status = [
@@ -338,18 +386,16 @@ def _tables(
             "seconds": np.array(trace.seconds),
         }
     )
-    x, sigma = np.array(trace.x).reshape(count, 2 * n), np.array(trace.sigma).reshape(count, 2 * n)
-    degree = np.concatenate([np.full(n, 180.0 / np.pi), np.ones(n)])
-    element = [f"bus/{name}" for name in network.buses.name]
+    x, sigma = np.array(trace.x).reshape(count, n), np.array(trace.sigma).reshape(count, n)
     estimated = pd.DataFrame(
         {
             "method": method,
             "trial": np.int32(trial),
-            "time_utc": times.repeat(2 * n),
-            "element": np.tile(np.array(element * 2, dtype=object), count),
-            "quantity": np.tile(np.array(["va_degree"] * n + ["vm_pu"] * n, dtype=object), count),
-            "value": (x * degree).ravel(),
-            "sigma": (sigma * degree).ravel(),
+            "time_utc": times.repeat(n),
+            "element": np.tile(states.element, count),
+            "quantity": np.tile(states.quantity, count),
+            "value": (x * states.factor).ravel(),
+            "sigma": (sigma * states.factor).ravel(),
         }
     )
     at, row = np.nonzero(used)

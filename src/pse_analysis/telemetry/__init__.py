@@ -6,6 +6,7 @@ from pse_analysis.telemetry.channels import check_channels, check_shunts
 from pse_analysis.telemetry.ingestion import ingest
 from pse_analysis.telemetry.tables import (
     RawCase,
+    read_model,
     read_raw,
     read_table,
     read_telemetry,
@@ -18,6 +19,7 @@ __all__ = [
     "check_channels",
     "check_shunts",
     "ingest",
+    "read_model",
     "read_raw",
     "read_table",
     "read_telemetry",

@@ -1,4 +1,4 @@
-"""Whether channels fit the grid, and whether injections are free of shunts."""
+"""Whether channels fit the grid or machine, and whether injections are free of shunts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ import pandas as pd
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.machine import INPUT, STATES, Machine
+from pse_analysis.measurement import Model
 from pse_analysis.vocabulary import UNITS, Quantity, check
 
 FloatArray = npt.NDArray[np.float64]
 
 _VOLTAGES = (Quantity.VM_PU, Quantity.VA_DEGREE)
+_OF_MACHINE = (INPUT, *STATES)
 
 
-def check_channels(channels: pd.DataFrame, network: Network) -> pd.DataFrame:
+def check_channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     """The channels table, with its columns, elements, sides and units checked.
 
     Raises
@@ -36,21 +39,32 @@ def check_channels(channels: pd.DataFrame, network: Network) -> pd.DataFrame:
                 f"received {row['sigma']!r}; take it from the sensor's accuracy class"
             )
     checked = check("channels", channels)
-    names = {"bus": network.buses.name, "branch": network.branches.name}
+    names: dict[str, tuple[str, ...]] = (
+        {"machine": (model.name,)}
+        if isinstance(model, Machine)
+        else {"bus": model.buses.name, "branch": model.branches.name}
+    )
+    owner = model.element if isinstance(model, Machine) else model.name
     known = {kind: set(of) for kind, of in names.items()}
     for channel, quantity, element, side, unit in zip(
         *(checked[c] for c in ("channel", "quantity", "element", "side", "unit")), strict=True
     ):
         kind, _, name = element.partition("/")
-        if name not in known[kind]:
+        if name not in known.get(kind, ()):
+            near = names.get(kind) or [f"{k}/{n}" for k, of in names.items() for n in of]
             raise TableError(
-                f"channels: {channel!r} stands at {element!r}, but {network.name} has no {kind} "
-                f"{name!r}: {suggest(name, names[kind])}"
+                f"channels: {channel!r} stands at {element!r}, but {owner} has no {kind} "
+                f"{name!r}: {suggest(name, near)}"
             )
-        if (side == "") != (kind == "bus"):
+        if (side == "") != (kind != "branch"):
             raise TableError(
                 f"channels: side of {channel!r} at {element!r}: expected "
-                f"{repr('') if kind == 'bus' else 'from or to'}, received {side!r}"
+                f"{'from or to' if kind == 'branch' else repr('')}, received {side!r}"
+            )
+        if (kind == "machine") != (quantity in _OF_MACHINE):
+            raise TableError(
+                f"channels: {channel!r} measures {quantity} at {element!r}: of a machine expected "
+                f"{', '.join(_OF_MACHINE)}, of a grid any other quantity"
             )
         if kind == "branch" and quantity in _VOLTAGES:
             raise TableError(

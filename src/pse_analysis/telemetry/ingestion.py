@@ -10,7 +10,7 @@ import pandas as pd
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import SensorLayout
+from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.telemetry.channels import check_channels, check_known, check_shunts
 from pse_analysis.telemetry.tables import RawCase
 from pse_analysis.vocabulary import UNITS, Quantity, check
@@ -36,7 +36,7 @@ _CHANNEL_DEFAULTS: Mapping[str, object] = {
 def ingest(
     frame: pd.DataFrame,
     channels: pd.DataFrame,
-    network: Network,
+    model: Model,
     *,
     timezone: str | None = None,
     columns: Mapping[str, str] | None = None,
@@ -58,8 +58,8 @@ def ingest(
         absent. ``unit``, ``sigma``, limits and ``sign`` describe the values as they are in
         ``frame``; sign −1 says that the source counts consumption, or flow out of the branch, as
         positive.
-    network
-        The grid.
+    model
+        The grid, or the machine.
     timezone
         Zone of times that carry none, e.g. ``Europe/Berlin``; without it such times are refused.
     columns
@@ -82,7 +82,7 @@ def ingest(
     TableError
         With what was expected, what came and what to do.
     """
-    given = _channels(channels, network)
+    given = _channels(channels, model)
     frame = frame.rename(columns=dict(columns or {}))
     for name in ("channel", "time_utc", "value"):
         if name not in frame.columns:
@@ -110,8 +110,8 @@ def ingest(
         sign=np.ones(len(given), dtype=np.int8),
     )
     ratio = (
-        SensorLayout.from_channels(given, network).scale
-        / SensorLayout.from_channels(standard, network).scale
+        SensorLayout.from_channels(given, model).scale
+        / SensorLayout.from_channels(standard, model).scale
     )
     row = pd.Index(given["channel"]).get_indexer(pd.Index(channel))
     time = _utc(frame["time_utc"], "time_utc", timezone)
@@ -141,13 +141,13 @@ def ingest(
     telemetry = telemetry if order is None else telemetry.take(order)
     telemetry["seq"] = telemetry.groupby(["trial", "channel"]).cumcount().astype(np.int64)
     translated = _translated(standard, ratio)
-    if shunts == "refuse":
-        check_shunts(telemetry, translated, network)
+    if shunts == "refuse" and isinstance(model, Network):
+        check_shunts(telemetry, translated, model)
     telemetry = telemetry.sort_values(["trial", "channel", "seq"], ignore_index=True)
-    return RawCase(network, translated, check("telemetry", telemetry))
+    return RawCase(model, translated, check("telemetry", telemetry))
 
 
-def _channels(channels: pd.DataFrame, network: Network) -> pd.DataFrame:
+def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     """The channels as given, with defaults, plain spellings of units and the schema's types."""
     filled = channels.assign(
         **{n: v for n, v in _CHANNEL_DEFAULTS.items() if n not in channels.columns}
@@ -160,7 +160,7 @@ def _channels(channels: pd.DataFrame, network: Network) -> pd.DataFrame:
             filled[name] = filled[name].astype(np.float64)
     if "sign" in filled.columns and pd.api.types.is_numeric_dtype(filled["sign"].dtype):
         filled["sign"] = filled["sign"].astype(np.int8)
-    return check_channels(filled.reset_index(drop=True), network)
+    return check_channels(filled.reset_index(drop=True), model)
 
 
 def _translated(

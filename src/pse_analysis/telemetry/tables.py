@@ -3,7 +3,7 @@
 ::
 
     telemetry/source=<source>/date=<YYYY-MM-DD>/part-0.parquet
-    channels.parquet  grid/{network,buses,branches}.parquet
+    channels.parquet  grid/{network,buses,branches}.parquet, or machine.parquet in place of a grid
     truth.parquet  sample_truth.parquet  faults.parquet        simulated cases only
 
 The date is the UTC date of ``time_utc``. Files carry no time of writing, so equal tables give equal
@@ -24,6 +24,8 @@ import pyarrow.parquet as pq
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
+from pse_analysis.machine import Machine
+from pse_analysis.measurement import Model
 from pse_analysis.telemetry.channels import check_channels, check_known
 from pse_analysis.vocabulary import check, schema
 
@@ -37,20 +39,33 @@ class RawCase:
 
     Attributes
     ----------
-    network
-        The grid.
+    model
+        The grid, or the machine.
     channels, telemetry
         Tables ``channels`` and ``telemetry`` of `pse_analysis.vocabulary`.
     truth, sample_truth, faults
         What only a simulation knows; None otherwise.
     """
 
-    network: Network
+    model: Model
     channels: pd.DataFrame
     telemetry: pd.DataFrame
     truth: pd.DataFrame | None = None
     sample_truth: pd.DataFrame | None = None
     faults: pd.DataFrame | None = None
+
+    @property
+    def network(self) -> Network:
+        """The grid.
+
+        Raises
+        ------
+        TableError
+            If the case is about a machine.
+        """
+        if isinstance(self.model, Machine):
+            raise TableError(f"the case is about {self.model.element}, not about a grid: use model")
+        return self.model
 
 
 def arrow_type(dtype: object) -> pa.DataType:
@@ -182,7 +197,7 @@ def write_raw(folder: str | Path, raw: RawCase) -> None:
             f"{folder} already holds telemetry, which is never overwritten: choose another "
             "folder, or remove that one first"
         )
-    channels = check_channels(raw.channels, raw.network)
+    channels = check_channels(raw.channels, raw.model)
     telemetry = check("telemetry", raw.telemetry)
     check_known(telemetry, channels)
     for table in OPTIONAL_TABLES:
@@ -190,10 +205,16 @@ def write_raw(folder: str | Path, raw: RawCase) -> None:
         if frame is not None:
             write_table(folder / f"{table}.parquet", frame, table)
     _write(folder / "channels.parquet", channels, "channels")
-    for name, frame in raw.network.to_tables().items():
-        (folder / "grid").mkdir(parents=True, exist_ok=True)
+    tables = (
+        {"machine": raw.model.to_table()}
+        if isinstance(raw.model, Machine)
+        else {f"grid/{name}": frame for name, frame in raw.model.to_tables().items()}
+    )
+    for name, frame in tables.items():
+        path = folder / f"{name}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
         arrow = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata(None)
-        pq.write_table(arrow, folder / "grid" / f"{name}.parquet", compression="zstd")
+        pq.write_table(arrow, path, compression="zstd")
     _write_partitions(folder / "telemetry", telemetry, channels)
 
 
@@ -280,11 +301,12 @@ def read_raw(folder: str | Path) -> RawCase:
     folder = Path(folder)
     if not folder.is_dir():
         raise TableError(
-            f"no raw folder {folder}; expected telemetry/, channels.parquet and grid/ in it: write "
-            "it with pse_analysis.telemetry.write_raw, or run the case's simulation"
+            f"no raw folder {folder}; expected telemetry/, channels.parquet and grid/ or "
+            "machine.parquet in it: write it with pse_analysis.telemetry.write_raw, or run the "
+            "case's simulation"
         )
-    network = Network.from_tables(**{n: _read_grid(folder / "grid", n) for n in GRID_TABLES})
-    channels = check_channels(_to_pandas(_read(folder / "channels.parquet", "channels")), network)
+    model = read_model(folder)
+    channels = check_channels(_to_pandas(_read(folder / "channels.parquet", "channels")), model)
     telemetry = read_telemetry(folder)
     check_known(telemetry, channels)
     optional = {
@@ -292,15 +314,30 @@ def read_raw(folder: str | Path) -> RawCase:
         for table in OPTIONAL_TABLES
         if (folder / f"{table}.parquet").is_file()
     }
-    return RawCase(network, channels, telemetry, **optional)
+    return RawCase(model, channels, telemetry, **optional)
 
 
-def _read_grid(folder: Path, name: str) -> pd.DataFrame:
-    path = folder / f"{name}.parquet"
+def read_model(folder: str | Path) -> Model:
+    """The grid or machine of a raw folder.
+
+    Raises
+    ------
+    TableError
+        If one of its files is missing or not whole.
+    """
+    folder = Path(folder)
+    if (folder / "machine.parquet").is_file():
+        return Machine.from_table(_read_model_table(folder / "machine.parquet"))
+    return Network.from_tables(
+        **{n: _read_model_table(folder / "grid" / f"{n}.parquet") for n in GRID_TABLES}
+    )
+
+
+def _read_model_table(path: Path) -> pd.DataFrame:
     if not path.is_file():
         raise TableError(
-            f"grid: no file {path}; expected {', '.join(f'{n}.parquet' for n in GRID_TABLES)} "
-            "beside it: write them with pse_analysis.telemetry.write_raw"
+            f"grid: no file {path}; expected {', '.join(f'{n}.parquet' for n in GRID_TABLES)} in "
+            "grid/, or machine.parquet: write them with pse_analysis.telemetry.write_raw"
         )
     try:
         frame: pd.DataFrame = pq.ParquetFile(path).read().to_pandas()

@@ -11,6 +11,7 @@ from pse_analysis.estimation.machine.gain import (
     require_solvable,
 )
 from pse_analysis.estimation.machine.observer import ObserverState, observe, observer
+from pse_analysis.estimation.machine.study import ObserverParams, from_params, snapshots
 from pse_analysis.estimation.machine.tuning import (
     ModelError,
     Tuned,
@@ -24,6 +25,7 @@ from pse_analysis.estimation.machine.tuning import (
 __all__ = [
     "Finding",
     "ModelError",
+    "ObserverParams",
     "ObserverState",
     "Poles",
     "Tuned",
@@ -33,11 +35,13 @@ __all__ = [
     "discrete_covariance",
     "discrete_gain",
     "findings",
+    "from_params",
     "gain_without_damping",
     "model_error",
     "observe",
     "observer",
     "require_solvable",
     "rms",
+    "snapshots",
     "tune",
 ]

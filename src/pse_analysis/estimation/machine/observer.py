@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Snapshot
 from pse_analysis.estimation.machine.gain import Poles, Tuning, discrete_gain, filter_gain
 from pse_analysis.machine import Densities, Machine, Sampled, sample
 from pse_analysis.vocabulary import Status
@@ -152,8 +152,8 @@ def observer(
         # The noise of a sample belongs to the telemetry's step, however long ago the last one was.
         return advance(prior, snapshot, over._replace(R=trusted.R / step_s), detail)
 
-    def read(state: ObserverState) -> Voltages:
-        return Voltages(state.x, state.P)
+    def read(state: ObserverState) -> Estimate:
+        return Estimate(state.x, state.P)
 
     missing = NEEDS_INPUT.format(base=machine.s_mva, element=machine.element)
     return Estimator(name, init, step, read)
