@@ -106,6 +106,65 @@ def test_sample_faults_get_their_reason() -> None:
     assert {i: r for i, r in enumerate(found) if r} == expected
 
 
+def test_a_telegram_delivered_twice_is_a_duplicate_even_with_two_stamps() -> None:
+    value, seconds = walk(40), np.arange(40) * 300.0
+    value[21], seconds[21] = value[20], seconds[20] + 40.0
+    value[31] = value[30]
+    found = reasons(telemetry(value, seconds))
+    assert found[21] == Reason.DUPLICATE
+    assert found[31] == 0
+
+
+@pytest.mark.parametrize("k", ["optimal", "scan", 0.5])
+def test_the_coefficient_is_optimal_scanned_or_given(k: str | float) -> None:
+    rng = np.random.default_rng(15)
+    change = np.zeros(3_000)
+    for i in range(1, 3_000):
+        change[i] = 0.5 * change[i - 1] + 0.1 * rng.standard_normal()
+    value = 20.0 + np.cumsum(change)
+    value[2_500] += 5.0
+    end = HISTORY_END + pd.Timedelta("6D")
+    rules = ValidateParams((Rule(k=k, criterion="fixed", quantile=4.0),))
+    out = validate(telemetry(value), channels(), rules, history_end=end)
+    assert out["reasons"].iloc[2_500] == Reason.EXTRAPOLATION
+    assert out["threshold"].iloc[2_400] == pytest.approx(0.4, rel=0.06)
+    naive = ValidateParams((Rule(k=0.0, criterion="fixed", quantile=4.0),))
+    wide = validate(telemetry(value), channels(), naive, history_end=end)
+    assert wide["reasons"].iloc[2_500] == Reason.INCREMENT
+    assert wide["threshold"].iloc[2_400] > 1.1 * out["threshold"].iloc[2_400]
+
+
+def test_criteria_set_the_threshold() -> None:
+    value = walk(900)
+    quantile = {}
+    for name, rule in {
+        "bayes": Rule(q=0.05),
+        "minimax": Rule(criterion="minimax", q_max=0.05),
+        "loose": Rule(criterion="minimax"),
+        "fixed": Rule(criterion="fixed", quantile=3.0),
+    }.items():
+        out = validate(
+            telemetry(value), channels(), ValidateParams((rule,)), history_end=HISTORY_END
+        )
+        quantile[name] = out["threshold"].iloc[300:].median()
+    assert quantile["bayes"] / quantile["fixed"] == pytest.approx(3.004 / 3.0, rel=1e-3)
+    assert quantile["minimax"] == pytest.approx(quantile["bayes"], rel=1e-9)
+    assert quantile["loose"] / quantile["fixed"] == pytest.approx(1.256 / 3.0, rel=2e-3)
+
+
+def test_the_default_count_of_a_stuck_source_comes_from_its_history() -> None:
+    restless, coarse = walk(900), np.round(walk(900), 0)
+    restless[500:510] = restless[500]
+    found = np.array(validate(telemetry(restless), channels(), history_end=HISTORY_END)["reasons"])
+    assert np.flatnonzero(found & Reason.STUCK).tolist() == list(range(504, 510))
+    found = np.array(validate(telemetry(coarse), channels(), history_end=HISTORY_END)["reasons"])
+    assert not (found[:100] & Reason.STUCK).any()
+    asleep = restless.copy()
+    asleep[700:] = 0.0
+    found = np.array(validate(telemetry(asleep), channels(), history_end=HISTORY_END)["reasons"])
+    assert not (found[700:] & Reason.STUCK).any()
+
+
 def test_no_row_is_lost_and_the_rows_keep_their_order_and_index() -> None:
     frame = pd.concat([telemetry(walk(30)), telemetry(walk(30, 12)).assign(trial=np.int32(1))])
     shuffled = frame.sample(frac=1.0, random_state=5)

@@ -95,7 +95,7 @@ def validate(
         known = np.where(stamps.arrived, stamps.arrival, stamps.time)
         history = (stamps.time < until) & (known < until)
     late = np.array([np.nan if r.late_s is None else r.late_s for r in lane_rules])
-    reasons, backward = time_reasons(stamps, period, late, history)
+    reasons, backward = time_reasons(stamps, value, period, late, history)
     checks_time = np.array(["time" in (r.checks or ()) for r in lane_rules], dtype=bool)
     reasons[~checks_time[stamps.lane]] &= int(Reason.DUPLICATE | Reason.BACKWARD)
     reasons |= _quality(telemetry["quality"].iloc[order], lane_rules, stamps.lane)

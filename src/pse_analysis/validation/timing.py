@@ -73,6 +73,21 @@ def duplicates(stamps: Stamps) -> Bools:
     return out
 
 
+def echoes(stamps: Stamps, value: Array, period_s: Array) -> Bools:
+    """Samples that repeat their predecessor's value within half a period of its stamp.
+
+    A source without a clock of its own is stamped on arrival, so a telegram that is delivered
+    twice comes with two stamps.
+    """
+    out = np.zeros(len(stamps.time), dtype=bool)
+    if len(out) > 1:
+        same = (value[1:] == value[:-1]) & (stamps.lane[1:] == stamps.lane[:-1])
+        at = np.flatnonzero(same) + 1
+        soon = 0.5e6 * period_s[stamps.lane[at]]
+        out[at] = np.abs(stamps.time[at] - stamps.time[at - 1]) < soon
+    return out
+
+
 def usual_delay(stamps: Stamps, history: Bools) -> Array:
     """Median delay of arrival in the history of each lane; 0 where it has none. [s]"""
     out = np.zeros(len(stamps.start))
@@ -90,13 +105,15 @@ def usual_delay(stamps: Stamps, history: Bools) -> Array:
 
 
 def time_reasons(
-    stamps: Stamps, period_s: Array, late_s: Array, history: Bools
+    stamps: Stamps, value: Array, period_s: Array, late_s: Array, history: Bools
 ) -> tuple[npt.NDArray[np.int32], Bools]:
     """Reasons of the time checks, and which samples are older than one that arrived before them.
 
     Parameters
     ----------
     stamps : Stamps
+    value : (n,)
+        [unit]
     period_s : (n_lane,)
         Sampling period. [s]
     late_s : (n_lane,)
@@ -107,7 +124,7 @@ def time_reasons(
     reasons = np.zeros(len(stamps.time), dtype=np.int32)
     latest = latest_before(stamps)
     some = latest != NO_TIME
-    repeated = duplicates(stamps)
+    repeated = duplicates(stamps) | echoes(stamps, value, period_s)
     backward = some & (stamps.time < latest) & ~repeated
     period = period_s[stamps.lane] * 1e6
     gap = some & ~repeated & ~backward
