@@ -238,6 +238,7 @@ def schema(table: str) -> pa.DataFrameSchema:
         If there is no such table.
     """
     import pandera.pandas as pa
+    from pandas.api.types import infer_dtype
 
     def col(
         kind: object, *checks: pa.Check, nullable: bool = False, required: bool = True
@@ -246,11 +247,19 @@ def schema(table: str) -> pa.DataFrameSchema:
             kind, checks=list(checks), nullable=nullable, required=required, coerce=False
         )
 
+    def text(*checks: pa.Check) -> pa.Column:
+        # pandas' own look at the values: pandera's calls Python once per row.
+        strings = pa.Check(
+            lambda values: infer_dtype(values, skipna=False) in ("string", "empty"),
+            error="text",
+        )
+        return col(None, strings, *checks)
+
     def one_of(values: type[enum.StrEnum]) -> pa.Check:
         return pa.Check.isin([str(v) for v in values])
 
     utc = "datetime64[us, UTC]"
-    key_sample = {"trial": col("int32"), "channel": col(str), "seq": col("int64")}
+    key_sample = {"trial": col("int32"), "channel": text(), "seq": col("int64")}
     sample = {
         "time_utc": col(utc),
         "arrival_utc": col(utc, nullable=True),
@@ -261,38 +270,38 @@ def schema(table: str) -> pa.DataFrameSchema:
         "flag": col("int8", pa.Check.isin([int(f) for f in Flag])),
         "reasons": col("int32"),
     }
-    step_key = {"method": col(str), "trial": col("int32"), "time_utc": col(utc)}
+    step_key = {"method": text(), "trial": col("int32"), "time_utc": col(utc)}
     tables: dict[str, dict[str, pa.Column]] = {
         "telemetry": {**key_sample, **sample},
         "channels": {
-            "channel": col(str),
-            "source": col(str, one_of(Source)),
-            "quantity": col(str, one_of(Quantity)),
-            "element": col(str, pa.Check.str_matches(r"^(bus|branch|machine)/.+")),
-            "side": col(str, one_of(Side)),
-            "unit": col(str),
+            "channel": text(),
+            "source": text(one_of(Source)),
+            "quantity": text(one_of(Quantity)),
+            "element": text(pa.Check.str_matches(r"^(bus|branch|machine)/.+")),
+            "side": text(one_of(Side)),
+            "unit": text(),
             "sigma": col("float64", pa.Check.gt(0)),
-            "sigma_kind": col(str, one_of(SigmaKind)),
+            "sigma_kind": text(one_of(SigmaKind)),
             "lower": col("float64", nullable=True),
             "upper": col("float64", nullable=True),
             "period_s": col("float64", pa.Check.gt(0)),
             "sign": col("int8", pa.Check.isin([-1, 1])),
-            "aggregation": col(str, one_of(Aggregation)),
+            "aggregation": text(one_of(Aggregation)),
         },
         "truth": {
             "trial": col("int32"),
             "time_utc": col(utc),
-            "element": col(str),
-            "quantity": col(str, one_of(Quantity)),
+            "element": text(),
+            "quantity": text(one_of(Quantity)),
             "value": col("float64"),
         },
         "sample_truth": {**key_sample, "time_utc": col(utc), "value": col("float64")},
         "faults": {
             "trial": col("int32"),
-            "channel": col(str),
+            "channel": text(),
             "seq": col("Int64", nullable=True),
             "time_utc": col(utc),
-            "kind": col(str, one_of(FaultKind)),
+            "kind": text(one_of(FaultKind)),
             "size": col("float64"),
         },
         "validated": {
@@ -304,14 +313,14 @@ def schema(table: str) -> pa.DataFrameSchema:
             "corrected": col("float64", nullable=True),
         },
         "aligned": {
-            "variant": col(str),
+            "variant": text(),
             "trial": col("int32"),
             "time_utc": col(utc),
-            "channel": col(str),
+            "channel": text(),
             "value_pu": col("float64"),
             "sigma_pu": col("float64", pa.Check.gt(0)),
             "sigma_age_pu": col("float64", pa.Check.ge(0)),
-            "origin": col(str, one_of(Origin)),
+            "origin": text(one_of(Origin)),
             "sample_utc": col(utc),
             "time_confidence": col("float64", pa.Check.in_range(0, 1)),
             "age_s": col("float64", pa.Check.ge(0)),
@@ -319,14 +328,14 @@ def schema(table: str) -> pa.DataFrameSchema:
         },
         "estimated": {
             **step_key,
-            "element": col(str),
-            "quantity": col(str, one_of(Quantity)),
+            "element": text(),
+            "quantity": text(one_of(Quantity)),
             "value": col("float64", nullable=True),
             "sigma": col("float64", nullable=True),
         },
         "residuals": {
             **step_key,
-            "channel": col(str),
+            "channel": text(),
             "innovation": col("float64"),
             "sigma_innovation": col("float64", pa.Check.gt(0)),
             "inflation": col("float64", pa.Check.ge(0)),
@@ -335,7 +344,7 @@ def schema(table: str) -> pa.DataFrameSchema:
         },
         "steps": {
             **step_key,
-            "status": col(str, one_of(Status)),
+            "status": text(one_of(Status)),
             "iterations": col("int32"),
             "nis": col("float64", nullable=True),
             "nees": col("float64", nullable=True),
@@ -344,14 +353,14 @@ def schema(table: str) -> pa.DataFrameSchema:
             "seconds": col("float64"),
         },
         "scored": {
-            "method": col(str),
+            "method": text(),
             "trial": col("int32"),
-            "metric": col(str),
-            "element": col(str),
+            "metric": text(),
+            "element": text(),
             "value": col("float64", nullable=True),
-            "unit": col(str),
+            "unit": text(),
             "published": col("float64", nullable=True),
-            "source": col(str),
+            "source": text(),
         },
     }
     return pa.DataFrameSchema(tables[table], strict="filter", name=table)

@@ -69,10 +69,10 @@ class RawCase:
 
 
 def arrow_type(dtype: object) -> pa.DataType:
-    """Arrow type of a column's type in `pse_analysis.vocabulary.schema`."""
-    name = str(dtype)
-    if name == "str":
+    """Arrow type of a column's type in `pse_analysis.vocabulary.schema`; text has none there."""
+    if dtype is None:
         return pa.string()
+    name = str(dtype)
     if name.startswith("datetime64"):
         return pa.timestamp("us", tz="UTC")
     if name == "bool":
