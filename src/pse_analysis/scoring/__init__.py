@@ -2,14 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import pandas as pd
 
-from pse_analysis.scoring import consistency, detection, errors
+from pse_analysis.errors import ParameterError
+from pse_analysis.scoring import consistency, detection, errors, observers
 from pse_analysis.vocabulary import check
 
-__all__ = ["ScoreParams", "consistency", "detection", "errors", "score"]
+__all__ = [
+    "Published",
+    "ScoreParams",
+    "consistency",
+    "detection",
+    "errors",
+    "observers",
+    "score",
+]
+
+
+@dataclass(frozen=True)
+class Published:
+    """A printed number that stands beside a score.
+
+    Attributes
+    ----------
+    method, metric, element : str
+        Of the score.
+    value : float
+        As printed.
+    source : str
+        Paper and place.
+    """
+
+    method: str
+    metric: str
+    value: float
+    source: str
+    element: str = ""
 
 
 @dataclass(frozen=True)
@@ -22,10 +53,16 @@ class ScoreParams:
         Whether consistency is also given by hour of day (UTC).
     by_element : bool
         Whether errors are also given by bus.
+    settling : SettlingParams
+        When an observer of a machine counts as settled.
+    published : tuple of Published
+        Printed numbers, which no score is computed from.
     """
 
     by_hour: bool = True
     by_element: bool = True
+    settling: observers.SettlingParams = field(default_factory=observers.SettlingParams)
+    published: tuple[Published, ...] = ()
 
 
 def score(
@@ -35,6 +72,8 @@ def score(
     truth: pd.DataFrame | None = None,
     faults: pd.DataFrame | None = None,
     params: ScoreParams | None = None,
+    *,
+    expected: Mapping[str, observers.Expected] | None = None,
 ) -> pd.DataFrame:
     """Score every method and trial of a case.
 
@@ -45,6 +84,8 @@ def score(
     truth, faults : DataFrame, optional
         Of simulated cases; without them what needs them is left out.
     params : ScoreParams, optional
+    expected : mapping of str to Expected, optional
+        What theory says of each observer of a machine.
 
     Returns
     -------
@@ -56,12 +97,30 @@ def score(
     parts = [consistency.of_steps(steps, by_hour=params.by_hour)]
     if truth is not None:
         paired = errors.against_truth(estimated, truth)
-        parts.append(errors.of_voltages(paired, by_element=params.by_element))
+        parts.append(errors.of_states(paired, by_element=params.by_element))
         parts.append(consistency.coverage(paired, by_hour=params.by_hour))
+        if expected:
+            parts.append(observers.of_observers(paired, expected, params.settling))
     if faults is not None:
         parts.append(detection.of_faults(validated, faults))
     scored = pd.concat([p for p in parts if len(p)], ignore_index=True)
-    scored["published"] = float("nan")
-    scored["source"] = ""
+    scored = _beside_print(scored, params.published)
     scored["trial"] = scored["trial"].astype("int32")
     return check("scored", scored)
+
+
+def _beside_print(scored: pd.DataFrame, published: tuple[Published, ...]) -> pd.DataFrame:
+    scored = scored.assign(published=float("nan"), source="")
+    for one in published:
+        rows = (
+            (scored["method"] == one.method)
+            & (scored["metric"] == one.metric)
+            & (scored["element"] == one.element)
+        )
+        if not rows.any():
+            raise ParameterError(
+                f"[score.published] no score {one.metric!r} of method {one.method!r}: expected one "
+                f"of {', '.join(sorted(set(scored['metric'])))}"
+            )
+        scored.loc[rows, ["published", "source"]] = [one.value, one.source]
+    return scored

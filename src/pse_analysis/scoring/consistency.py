@@ -84,10 +84,11 @@ def coverage(paired: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Metrics ``coverage_vm`` and ``coverage_va``. Exact zeros of σ (a reference angle that is
+        Metrics ``coverage_vm`` and ``coverage_va``, of a rotor ``coverage_angle`` and
+        ``coverage_speed``. Exact zeros of σ (a reference angle that is
         fixed) do not count.
     """
-    rows = []
+    rows: list[pd.DataFrame] = []
     free = paired[paired["sigma"] > 0]
     table = free.assign(
         inside=(free["error"].abs() <= 2.0 * free["sigma"]).astype(float),
@@ -95,12 +96,14 @@ def coverage(paired: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
     )
     for quantity, (name, _, _) in METRICS.items():
         part = table[table["quantity"] == quantity]
+        if part.empty:
+            continue
         keys = [["method", "trial"]] + ([["method", "trial", "element"]] if by_hour else [])
         rows.extend(
             _long(part.groupby(key, sort=True)["inside"].mean(), f"coverage_{name}", "1")
             for key in keys
         )
-    return pd.concat(rows, ignore_index=True)
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
 
 
 def _long(values: pd.Series, metric: str, unit: str) -> pd.DataFrame:

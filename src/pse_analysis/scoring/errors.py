@@ -1,4 +1,4 @@
-"""Errors of the estimated voltages against the simulated truth."""
+"""Errors of the estimated states against the simulated truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from pse_analysis.errors import TableError
 from pse_analysis.vocabulary import Quantity
 
 KEY = ["trial", "time_utc", "element", "quantity"]
-METRICS = {Quantity.VM_PU: ("vm", "pu", 1.0), Quantity.VA_DEGREE: ("va", "rad", np.pi / 180.0)}
+METRICS = {
+    Quantity.VM_PU: ("vm", "pu", 1.0),
+    Quantity.VA_DEGREE: ("va", "rad", np.pi / 180.0),
+    Quantity.ROTOR_ANGLE_RAD: ("angle", "rad", 1.0),
+    Quantity.ROTOR_SPEED_RAD_S: ("speed", "rad/s", 1.0),
+}
+"""Short name, unit and factor from the table's unit of each estimated quantity."""
 
 
 def against_truth(estimated: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
@@ -46,25 +52,28 @@ def against_truth(estimated: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     return paired
 
 
-def of_voltages(paired: pd.DataFrame, *, by_element: bool = True) -> pd.DataFrame:
-    """Mean and largest |error| over buses and instants.
+def of_states(paired: pd.DataFrame, *, by_element: bool = True) -> pd.DataFrame:
+    """Mean and largest |error| over elements and instants.
 
     Parameters
     ----------
     paired : DataFrame
         From `against_truth`.
     by_element : bool
-        Whether to add a row per bus.
+        Whether to add a row per element.
 
     Returns
     -------
     DataFrame
         Metrics ``vm_error_mean``, ``vm_error_max`` [p.u.], ``va_error_mean``, ``va_error_max``
-        [rad] (eq. (30) of [qi2025]), and ``vm_rmse``, ``va_rmse`` (eq. (35) of [qu2018]).
+        [rad] (eq. (30) of [qi2025]), and ``vm_rmse``, ``va_rmse`` (eq. (35) of [qu2018]); the same
+        with ``angle`` [rad] and ``speed`` [rad/s] for a machine's rotor.
     """
     rows = []
     for quantity, (name, unit, factor) in METRICS.items():
         part = paired[paired["quantity"] == quantity]
+        if part.empty:
+            continue
         size = part.assign(error=part["error"].abs() * factor, square=(part["error"] * factor) ** 2)
         keys = [["method", "trial"]] + ([["method", "trial", "element"]] if by_element else [])
         for key in keys:
@@ -80,4 +89,4 @@ def of_voltages(paired: pd.DataFrame, *, by_element: bool = True) -> pd.DataFram
                 values["element"] = ""
             long = values.melt(["method", "trial", "element"], var_name="metric")
             rows.append(long.assign(unit=unit))
-    return pd.concat(rows, ignore_index=True)
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()

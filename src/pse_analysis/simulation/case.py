@@ -84,7 +84,7 @@ def simulate(
         parts.append(
             (
                 _truth_table(network, truth, study, trial),
-                *_sample_tables(samples, channels, by_arrival, trial),
+                *sample_tables(samples, channels, by_arrival, trial),
             )
         )
     truth_table, telemetry, sample_truth, fault_table = (
@@ -93,7 +93,8 @@ def simulate(
     return RawCase(network, channels, telemetry, truth_table, sample_truth, fault_table)
 
 
-def _utc(microsecond: np.ndarray[tuple[int], np.dtype[np.int64]]) -> pd.DatetimeIndex:
+def utc(microsecond: np.ndarray[tuple[int], np.dtype[np.int64]]) -> pd.DatetimeIndex:
+    """Times from microseconds since 1970 UTC."""
     return pd.DatetimeIndex(microsecond.astype("datetime64[us]")).tz_localize("UTC")
 
 
@@ -114,7 +115,7 @@ def _truth_table(network: Network, truth: Truth, study: Study, trial: int) -> pd
     return pd.DataFrame(
         {
             "trial": np.full(values.size, trial, dtype=np.int32),
-            "time_utc": _utc(np.repeat(truth.time[at], n * len(quantities))),
+            "time_utc": utc(np.repeat(truth.time[at], n * len(quantities))),
             "element": np.tile(np.repeat(names, len(quantities)), len(at)),
             "quantity": np.tile(quantities, n * len(at)),
             "value": values.transpose(2, 1, 0).ravel(),
@@ -122,7 +123,7 @@ def _truth_table(network: Network, truth: Truth, study: Study, trial: int) -> pd
     )
 
 
-def _sample_tables(
+def sample_tables(
     samples: Samples,
     channels: pd.DataFrame,
     by_arrival: np.ndarray[tuple[int], np.dtype[np.bool_]],
@@ -145,14 +146,14 @@ def _sample_tables(
     telemetry = pd.DataFrame(
         {
             **key,
-            "time_utc": _utc(stamp[arrived]),
-            "arrival_utc": _utc(samples.arrival[arrived]),
+            "time_utc": utc(stamp[arrived]),
+            "arrival_utc": utc(samples.arrival[arrived]),
             "value": samples.value[arrived],
             "quality": pd.array(np.full(len(arrived), None), dtype="Int16"),
         }
     )
     sample_truth = pd.DataFrame(
-        {**key, "time_utc": _utc(samples.sampled[arrived]), "value": samples.truth[arrived]}
+        {**key, "time_utc": utc(samples.sampled[arrived]), "value": samples.truth[arrived]}
     )
     number = np.full(len(samples.kind), -1, dtype=np.int64)
     number[arrived] = seq
@@ -164,7 +165,7 @@ def _sample_tables(
             "trial": np.full(len(faulty), trial, dtype=np.int32),
             "channel": names[samples.channel[faulty]],
             "seq": pd.array(np.where(number[faulty] < 0, 0, number[faulty]), dtype="Int64"),
-            "time_utc": _utc(stamp[faulty]),
+            "time_utc": utc(stamp[faulty]),
             "kind": kinds[samples.kind[faulty] - 1],
             "size": samples.size[faulty],
         }
