@@ -227,7 +227,7 @@ def learn_load(
         correlation[np.ix_(meters.place, meters.place)] = within
     _fill_unmetered(deviation, network)
     if source is None:
-        source = learn_source(history, layout, network)
+        source = learn_source(history, layout, network, step_s)
     return LoadStatistics(deviation, correlation, source, slot_s)
 
 
@@ -354,7 +354,8 @@ def _shrunk_correlation(panel: FloatArray) -> FloatArray:
     k = panel.shape[1]
     if len(full) < 8:
         return np.eye(k)
-    centred = (full - full.mean(axis=0)) / full.std(axis=0)
+    # A meter that stands still has no correlation with any other.
+    centred = (full - full.mean(axis=0)) / np.maximum(full.std(axis=0), 1e-12)
     count = len(centred)
     sample = centred.T @ centred / count
     fourth = (centred**2).T @ centred**2 / count
@@ -378,7 +379,7 @@ def _fill_unmetered(deviation: FloatArray, network: Network) -> None:
     deviation[:, rest] = relative[:, None] * nominal[rest]
 
 
-def learn_source(history: Record, layout: SensorLayout, network: Network) -> float:
+def learn_source(history: Record, layout: SensorLayout, network: Network, step_s: float) -> float:
     """Learn σ of the source voltage's change per step as a local level under white noise.
 
     Every voltage reading, less the part that the metered injections explain (by the sensitivities
@@ -391,6 +392,8 @@ def learn_source(history: Record, layout: SensorLayout, network: Network) -> flo
     history : Record
     layout : SensorLayout
     network : Network
+    step_s : float
+        Step between instants; readings may come less often. [s]
 
     Returns
     -------
@@ -403,7 +406,8 @@ def learn_source(history: Record, layout: SensorLayout, network: Network) -> flo
         return USUAL_SOURCE
     explained = _explained_voltage(history, layout, network)
     reading = history.z[:, rows] - explained[:, layout.position[rows]]
-    reading = reading - np.nanmean(np.where(fresh, reading, np.nan), axis=0)
+    reading = np.where(fresh, reading, 0.0)
+    reading = reading - reading.sum(axis=0) / np.maximum(fresh.sum(axis=0), 1)
     count = fresh.sum(axis=1)
     level = np.where(fresh, reading, 0.0).sum(axis=1)[count > 0] / count[count > 0]
 
@@ -421,7 +425,9 @@ def learn_source(history: Record, layout: SensorLayout, network: Network) -> flo
 
     found = optimize.minimize_scalar(cost, bounds=(-12.0, 4.0), method="bounded")
     eta, variance = innovation(float(found.x))
-    return float(np.sqrt(np.exp(found.x) * np.mean(eta**2) / variance))
+    apart = np.diff(history.time[count > 0]) / np.timedelta64(1, "s")
+    steps = float(np.median(apart)) / step_s  # the walk moved so long between two readings
+    return float(np.sqrt(np.exp(found.x) * np.mean(eta**2) / variance / steps))
 
 
 def _explained_voltage(history: Record, layout: SensorLayout, network: Network) -> FloatArray:
