@@ -14,8 +14,10 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import enum
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -109,6 +111,31 @@ class Branches:
 
 
 _INTEGER = {"from_bus", "to_bus"}
+
+OPTIONAL: Mapping[str, float | bool] = MappingProxyType(
+    {
+        "p_load_mw": 0.0,
+        "q_load_mvar": 0.0,
+        "p_gen_mw": 0.0,
+        "vm_set_pu": 1.0,
+        "q_min_mvar": -np.inf,
+        "q_max_mvar": np.inf,
+        "g_shunt_pu": 0.0,
+        "b_shunt_pu": 0.0,
+        "g_pu": 0.0,
+        "b_pu": 0.0,
+        "tap": 1.0,
+        "shift_rad": 0.0,
+        "in_service": True,
+    }
+)
+"""Value of the columns of buses and branches that a table may leave out."""
+
+
+def _branch_names(branches: pd.DataFrame) -> list[str]:
+    ends = branches["from_bus"].astype(str) + "-" + branches["to_bus"].astype(str)
+    copy = ends.groupby(ends).cumcount() + 1
+    return [end if k == 1 else f"{end}#{k}" for end, k in zip(ends, copy, strict=True)]
 
 
 def _freeze(columns: Columns) -> None:
@@ -379,11 +406,30 @@ class Network:
     ) -> Network:
         """The grid from the tables that `to_tables` describes.
 
+        Parameters
+        ----------
+        network : DataFrame
+            One row: ``name`` and ``base_mva``.
+        buses : DataFrame
+            ``name``, ``kind`` and ``vn_kv``; other columns of `Buses` where they are not what
+            `OPTIONAL` says.
+        branches : DataFrame
+            ``from_bus`` and ``to_bus`` by name, ``r_pu`` and ``x_pu``; other columns of `Branches`
+            likewise. Without ``name`` branches are called ``from-to``, parallel ones ``from-to#2``.
+
         Raises
         ------
         GridError
             On a missing column or a branch that ends at an unknown bus.
         """
+        own = {f.name for f in dataclasses.fields(Buses)}
+        given = {k: v for k, v in OPTIONAL.items() if k in own and k not in buses}
+        buses = buses.assign(**given)
+        own = {f.name for f in dataclasses.fields(Branches)}
+        given = {k: v for k, v in OPTIONAL.items() if k in own and k not in branches}
+        branches = branches.assign(**given)
+        if "name" not in branches and {"from_bus", "to_bus"} <= set(branches.columns):
+            branches = branches.assign(name=_branch_names(branches))
         wanted = {
             "network": (network, ["name", "base_mva"]),
             "buses": (buses, [f.name for f in dataclasses.fields(Buses)]),
