@@ -401,6 +401,7 @@ def learn_source(history: Record, layout: SensorLayout, network: Network, step_s
         `USUAL_SOURCE` if there are fewer than 24 instants with a voltage reading. [p.u.]
     """
     rows = np.flatnonzero(layout.quantity == VM)
+    rows = rows[history.fresh[:, rows].any(axis=0)]
     fresh = history.fresh[:, rows]
     if fresh.any(axis=1).sum() < 24:
         return USUAL_SOURCE

@@ -71,10 +71,11 @@ class WlsSolution:
 
 
 class _Gain:
-    """JᵀR⁻¹J, assembled on a known pattern and factorised."""
+    """JᵀR⁻¹J, assembled on a known pattern in an order of little fill-in, and factorised."""
 
     def __init__(self, model: MeasurementModel) -> None:
         _, n = model.shape
+        self._n = n
         count = np.diff(model.indptr)
         # All pairs of entries that share a row: each adds one product to the gain.
         self._left = np.repeat(np.arange(len(model.indices)), count[model.row_of_entry])
@@ -82,12 +83,37 @@ class _Gain:
         span = count[model.row_of_entry]
         offset = np.arange(span.sum()) - np.repeat(np.cumsum(span) - span, span)
         self._right = np.repeat(first, span) + offset
-        code = model.indices[self._right].astype(np.int64) * n + model.indices[self._left]
-        places, self._place = np.unique(code, return_inverse=True)
-        self._indices = (places % n).astype(np.int32)
-        self._indptr = np.searchsorted(places // n, np.arange(n + 1)).astype(np.int32)
-        self._n = n
+        self._order = np.arange(n)
+        self._lay_out(model.indices.astype(np.int64))
+        # The order depends on the pattern alone, so it is found once.
+        pattern = np.where(self._indices == self._column, float(n), -0.5 / n)
+        self._matrix.data = pattern
+        self._order = np.argsort(self._superlu("MMD_AT_PLUS_A").perm_c)
+        place = np.empty(n, dtype=np.int64)
+        place[self._order] = np.arange(n)
+        self._lay_out(place[model.indices])
         self.factor: sparse_linalg.SuperLU | None = None
+
+    def _lay_out(self, column_of_entry: npt.NDArray[np.int64]) -> None:
+        """Pattern of the gain, with every entry's row and column, and where each product goes."""
+        n = self._n
+        code = column_of_entry[self._right] * n + column_of_entry[self._left]
+        places, self._place = np.unique(code, return_inverse=True)
+        # States in no measurement keep a place on the diagonal, to be found there.
+        own = np.arange(n) * (n + 1)
+        every = np.union1d(places, own)
+        self._place = np.searchsorted(every, places)[self._place]
+        self._own = np.searchsorted(every, own)
+        self._column, self._indices = every // n, (every % n).astype(np.int32)
+        indptr = np.searchsorted(self._column, np.arange(n + 1)).astype(np.int32)
+        self._matrix = sparse.csc_array(
+            (np.zeros(len(every)), self._indices, indptr), shape=(n, n)
+        )
+
+    def _superlu(self, order: str) -> sparse_linalg.SuperLU:
+        return sparse_linalg.splu(
+            self._matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
 
     def factorise(self, whitened: FloatArray) -> None:
         """Factorise the gain of whitened Jacobian entries.
@@ -102,38 +128,29 @@ class _Gain:
             weights=whitened[self._left] * whitened[self._right],
             minlength=len(self._indices),
         )
-        self.matrix = sparse.csc_array(
-            (data, self._indices, self._indptr), shape=(self._n, self._n)
-        )
-        diagonal = self.matrix.diagonal()
+        diagonal = data[self._own]
         if not (diagonal > 0).all():
             raise Unobservable("a state is in no measurement")
         # Scaled to a unit diagonal, a pivot is the share of a state that the others leave open.
-        scale = 1.0 / np.sqrt(diagonal)
-        self._scale = scale
-        columns = np.repeat(np.arange(self._n), np.diff(self._indptr))
-        scaled = sparse.csc_array(
-            (data * scale[self._indices] * scale[columns], self._indices, self._indptr),
-            shape=(self._n, self._n),
-        )
+        self._scale = 1.0 / np.sqrt(diagonal)
+        self._matrix.data = data * self._scale[self._indices] * self._scale[self._column]
         try:
-            self.factor = sparse_linalg.splu(
-                scaled,
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
+            self.factor = self._superlu("NATURAL")
         except RuntimeError as error:
             raise Unobservable("the gain is exactly singular") from error
         if np.abs(self.factor.U.diagonal()).min() < 1e-13:
             raise Unobservable("the gain is singular to working precision")
 
     def solve(self, right: FloatArray) -> FloatArray:
+        """Solution for one or many right-hand sides, in the order of the model's columns."""
         assert self.factor is not None
         scale = self._scale if right.ndim == 1 else self._scale[:, None]
-        return np.asarray(scale * self.factor.solve(scale * right))
+        solution = np.empty_like(right)
+        solution[self._order] = scale * self.factor.solve(scale * right[self._order])
+        return solution
 
     def inverse(self) -> FloatArray:
+        """Covariance of the model's columns. (n, n)"""
         inverse = self.solve(np.eye(self._n))
         return 0.5 * (inverse + inverse.T)
 
@@ -257,12 +274,12 @@ class WeightedLeastSquares:
         for iteration in range(1, self.max_iterations + 1):
             whitened = model.jacobian_data(x) * entry_weight
             self._gain.factorise(whitened)
-            gradient: FloatArray = np.bincount(
+            gradient = np.bincount(
                 model.indices,
                 weights=whitened * (weight * model.residual(z, x))[model.row_of_entry],
                 minlength=model.shape[1],
             )
-            step = self._gain.solve(gradient)
+            step = self._gain.solve(gradient.astype(float, copy=False))
             x = x.copy()
             x[model.columns] += step
             largest = np.abs(step).max(initial=0.0)

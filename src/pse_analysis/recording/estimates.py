@@ -212,7 +212,7 @@ def _errors(
 
 def _chosen_buses(vm: pd.DataFrame, measured: pd.DataFrame, limit: int = 4) -> list[str]:
     """The weakest bus, then measured ones spread over the grid's order."""
-    mean = vm.groupby("element").value.mean()
+    mean = vm.groupby("element").value.mean().dropna()
     if mean.empty:
         return []
     metered = [e for e in dict.fromkeys(vm.element) if e in set(measured.element)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
@@ -53,7 +54,7 @@ def of_steps(steps: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
         nis=steps["nis"].where(judged),
         dof=steps["dof"].where(judged),
         not_ok=(steps["status"] != Status.OK).astype(float),
-        element="hour/" + steps["time_utc"].dt.strftime("%H"),
+        element=_hour(steps["time_utc"]),
     )
     key = ["method", "trial"]
     whole = table.groupby(key, sort=True)
@@ -85,14 +86,13 @@ def coverage(paired: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
     -------
     DataFrame
         Metrics ``coverage_vm`` and ``coverage_va``, of a rotor ``coverage_angle`` and
-        ``coverage_speed``. Exact zeros of σ (a reference angle that is
-        fixed) do not count.
+        ``coverage_speed``. Exact zeros of σ (a reference angle that is fixed) do not count.
     """
     rows: list[pd.DataFrame] = []
     free = paired[paired["sigma"] > 0]
     table = free.assign(
         inside=(free["error"].abs() <= 2.0 * free["sigma"]).astype(float),
-        element="hour/" + free["time_utc"].dt.strftime("%H"),
+        element=_hour(free["time_utc"]),
     )
     for quantity, (name, _, _) in METRICS.items():
         part = table[table["quantity"] == quantity]
@@ -104,6 +104,12 @@ def coverage(paired: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
             for key in keys
         )
     return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+
+
+def _hour(times: pd.Series) -> npt.NDArray[np.object_]:
+    """``hour/00`` … ``hour/23`` of UTC times."""
+    names = np.array([f"hour/{hour:02d}" for hour in range(24)], dtype=object)
+    return np.asarray(names[times.dt.tz_convert("UTC").dt.hour.to_numpy()])
 
 
 def _long(values: pd.Series, metric: str, unit: str) -> pd.DataFrame:

@@ -22,8 +22,8 @@ def of_faults(validated: pd.DataFrame, faults: pd.DataFrame) -> pd.DataFrame:
     -------
     DataFrame
         Method "validate", by trial: ``found``, ``missed``, ``false_alarms`` (flagged samples
-        without a fault), ``precision``, ``recall``, ``false_alarm_rate`` (per good sample), and ``found``,
-        ``missed`` and ``recall`` by kind of fault in ``element``.
+        without a fault), ``precision``, ``recall``, ``false_alarm_rate`` (per good sample), and
+        ``found``, ``missed`` and ``recall`` by kind of fault in ``element``.
     """
     present = faults[faults["seq"].notna() & (faults["kind"] != FaultKind.LOST)]
     injected = present.assign(seq=present["seq"].astype("int64"))[[*KEY, "kind"]]
