@@ -83,8 +83,7 @@ def decide(
     wants_increment |= stated
 
     k = np.zeros(n)
-    count = np.zeros(n) if structure is None else structure.count
-    gains = extrapolation.significant(rho, count)
+    gains = np.zeros(n, dtype=bool) if structure is None else extrapolation.gains(structure)
     for index, rule in enumerate(rules):
         if rule.k == "optimal":
             k[index] = rho[index] if gains[index] else 0.0

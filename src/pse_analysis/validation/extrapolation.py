@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.validation.increments import autocorrelation
+from pse_analysis.validation.increments import Structure, autocorrelation
 from pse_analysis.validation.motion import SNAP
 
 Array = npt.NDArray[np.float64]
 
 SIGNIFICANT = 3.0
-"""Standard errors (1/√n under no correlation) that ρ̂₁ must lie from 0 for a gain to be claimed."""
+"""Standard errors by which the gain must exceed 0 for extrapolation to be used."""
 
 
 def closed_form(variance: npt.ArrayLike, m: int = 1) -> Array:
@@ -53,10 +53,15 @@ def gain_percent(naive_variance: npt.ArrayLike, optimal_variance: npt.ArrayLike)
         return np.asarray(100.0 * (naive - np.asarray(optimal_variance, dtype=float)) / naive)
 
 
-def significant(rho: npt.ArrayLike, count: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Whether ρ̂₁ from ``count`` increments differs from 0, so that extrapolation gains."""
-    n = np.maximum(np.asarray(count, dtype=float), 1.0)
-    return np.asarray(np.abs(np.asarray(rho, dtype=float)) > SIGNIFICANT / np.sqrt(n))
+def gains(structure: Structure) -> npt.NDArray[np.bool_]:
+    """Whether the history shows for sure that extrapolation gains; (n_channel,).
+
+    Notes
+    -----
+    The paired difference of squared errors must exceed 0 by `SIGNIFICANT` of its standard errors.
+    With n Gaussian increments that asks for |ρ̂₁| > 6/√n; with heavy tails for more.
+    """
+    return np.asarray(structure.evidence > SIGNIFICANT)
 
 
 def errors(value: npt.ArrayLike, k: float | Array, m: int = 1, time: Array | None = None) -> Array:

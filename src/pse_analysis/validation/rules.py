@@ -36,8 +36,9 @@ class Rule:
     source, quantity, channel : str
         Patterns of names (``*``, ``?``, ``[…]``); a channel must match all three.
     checks : tuple of str
-        Any of limits, increment, extrapolation, stuck, time. Default: all but ``increment``; the
-        extrapolation check is the first-increment check where extrapolation gains nothing.
+        Any of limits, increment, extrapolation, stuck, time (late samples and gaps; duplicates
+        and backward stamps are always flagged). Default: all but ``increment``; the extrapolation
+        check is the first-increment check, and called so, where the history shows no sure gain.
     unit : str
         Unit of ``lower``, ``upper`` and ``increment``. Default: each channel's own.
     lower, upper : float
