@@ -104,7 +104,7 @@ def test_measurement_noise_makes_the_coefficient_negative() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.05])
 def test_sigma_and_coefficient_survive_gross_errors_in_the_history(share: float) -> None:
-    x = load((5_000, 40), 21)
+    x = load((5_000, 20), 21)
     rng = np.random.default_rng(22)
     y = x + (rng.random(x.shape) < share) * rng.uniform(-6.0, 6.0, x.shape)
     found = learn(y, steps(y))
@@ -129,7 +129,7 @@ def test_sigma_follows_the_time_of_day_where_asked() -> None:
 @pytest.mark.parametrize("kind", ["increment", "extrapolation"])
 @pytest.mark.parametrize(("q", "ratio"), [(0.05, 1.0), (0.05, 5.0), (0.2, 2.0)])
 def test_predicted_rates_come_true_given_good_references(kind: str, q: float, ratio: float) -> None:
-    n, amplitude = 300_000, 6.0
+    n, amplitude = 200_000, 6.0
     sigma = 1.0 if kind == "increment" else math.sqrt(1.0 - RHO**2)
     answer = thresholds.bayes(q, ratio, amplitude / sigma)
     x = load((3, n), 31)
