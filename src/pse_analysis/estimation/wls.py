@@ -106,9 +106,7 @@ class _Gain:
         self._own = np.searchsorted(every, own)
         self._column, self._indices = every // n, (every % n).astype(np.int32)
         indptr = np.searchsorted(self._column, np.arange(n + 1)).astype(np.int32)
-        self._matrix = sparse.csc_array(
-            (np.zeros(len(every)), self._indices, indptr), shape=(n, n)
-        )
+        self._matrix = sparse.csc_array((np.zeros(len(every)), self._indices, indptr), shape=(n, n))
 
     def _superlu(self, order: str) -> sparse_linalg.SuperLU:
         return sparse_linalg.splu(
