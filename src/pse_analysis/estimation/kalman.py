@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
+from scipy import linalg, sparse
 
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation import intervals
@@ -59,14 +59,14 @@ def predict(state: KalmanState, noise: FloatArray) -> KalmanState:
 
 
 def update(
-    state: KalmanState, H: FloatArray, z: FloatArray, R: FloatArray
+    state: KalmanState, H: FloatArray | sparse.csr_array, z: FloatArray, R: FloatArray
 ) -> tuple[KalmanState, FloatArray, FloatArray, float]:
     """Condition on z = H x + v.
 
     Parameters
     ----------
     state : KalmanState
-    H : (m, n) ndarray
+    H : (m, n) ndarray or csr_array
     z : (m,) ndarray
     R : (m, m) ndarray
         Covariance of v.
@@ -196,12 +196,11 @@ def kalman_filter(
         at = before
         for passes in range(1, MAX_PASSES + 1):  # noqa: B007 (reported after the loop)
             H, z, spread = model.rows(snapshot.z, sigma, used, at)
-            H, z, spread = H[rows].toarray(), z[rows], spread[rows]
+            H, z, spread = sparse.csr_array(H[rows]), z[rows], spread[rows]
             R = bridge * (H @ walk @ H.T)
             R[np.diag_indices_from(R)] += spread**2
-            lagged = (share[:, :, None] * H[:, None, :]).reshape(len(rows), -1)
             try:
-                posterior, innovation, deviation, nis = update(prior, lagged, z, R)
+                posterior, innovation, deviation, nis = update(prior, _lagged(H, share), z, R)
             except np.linalg.LinAlgError:
                 return None, Info.nothing(
                     m,
@@ -226,6 +225,18 @@ def kalman_filter(
         return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
 
     return Estimator(name, init, step, read)
+
+
+def _lagged(H: sparse.csr_array, share: FloatArray) -> sparse.csr_array:
+    """[w₀H, w₁H, …, w_K H] with a row's own weights; most of them are zero. (m, (K+1)·2N)"""
+    m, n = H.shape
+    row = np.repeat(np.arange(m), np.diff(H.indptr))
+    data = H.data[:, None] * share[row]
+    column = H.indices[:, None] + n * np.arange(share.shape[1])
+    kept = share[row] != 0
+    count = np.bincount(row, weights=kept.sum(axis=1), minlength=m)
+    indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    return sparse.csr_array((data[kept], column[kept], indptr), shape=(m, n * share.shape[1]))
 
 
 def _voltage(x: FloatArray, n_bus: int) -> ComplexArray:
