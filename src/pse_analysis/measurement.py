@@ -10,8 +10,9 @@ S = V_m c*, so P, Q, |I| and ∠I at every place share one formula.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,6 +84,9 @@ class SensorLayout:
         σ in p.u. or rad, or a fraction where ``relative``.
     window_s : (m,) ndarray
         Length of the interval that a sample averages; 0 for instantaneous values. [s]
+    source : tuple of str, length m
+        Source of each row; magnitude and angle, or P and Q, of one source at one place belong
+        together.
     """
 
     channel: tuple[str, ...]
@@ -93,6 +97,7 @@ class SensorLayout:
     sigma: FloatArray
     relative: npt.NDArray[np.bool_]
     window_s: FloatArray
+    source: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.channel)
@@ -159,6 +164,7 @@ class SensorLayout:
                 channels["period_s"].to_numpy(dtype=float),
                 0.0,
             ),
+            source=tuple(channels["source"]),
         )
 
     @classmethod
@@ -191,6 +197,7 @@ class SensorLayout:
                 channels["period_s"].to_numpy(dtype=float),
                 0.0,
             ),
+            source=tuple(channels["source"]),
         )
 
     @classmethod
@@ -213,6 +220,7 @@ class SensorLayout:
             sigma=np.ones(m),
             relative=np.zeros(m, dtype=bool),
             window_s=np.zeros(m),
+            source=("",) * m,
         )
 
     def to_per_unit(self, values: FloatArray) -> FloatArray:
@@ -229,21 +237,11 @@ class SensorLayout:
 
     def take(self, rows: npt.NDArray[np.generic]) -> SensorLayout:
         """The layout of some of its rows."""
-        return SensorLayout(
-            tuple(np.asarray(self.channel, dtype=object)[rows]),
-            *(
-                getattr(self, name)[rows]
-                for name in (
-                    "quantity",
-                    "position",
-                    "side",
-                    "scale",
-                    "sigma",
-                    "relative",
-                    "window_s",
-                )
-            ),
-        )
+        names = [f.name for f in fields(self)]
+        columns: dict[str, Any] = {name: np.asarray(getattr(self, name))[rows] for name in names}
+        for name in ("channel", "source"):
+            columns[name] = tuple(map(str, columns[name]))
+        return SensorLayout(**columns)
 
     @property
     def has_angle(self) -> bool:
@@ -580,22 +578,15 @@ class RectangularModel:
 
 
 def _partners(layout: SensorLayout) -> IntArray:
-    """Row that holds the other half of each row's phasor, or -1."""
+    """Row that holds the other half of each row's phasor, or -1; -1 too where several could."""
     other = {VM: VA, VA: VM, IM: IA, IA: IM, P: Q, Q: P}
-    # Phasors belong together per device, which the channel id names before its quantity.
-    device = [name.rsplit(":", 1)[0] for name in layout.channel]
-    where = {
-        (d, q, p, s): i
-        for i, (d, q, p, s) in enumerate(
-            zip(device, layout.quantity, layout.position, layout.side, strict=True)
-        )
-    }
-    return np.array(
-        [
-            where.get((d, other[int(q)], p, s), -1)
-            for d, q, p, s in zip(
-                device, layout.quantity, layout.position, layout.side, strict=True
-            )
-        ],
-        dtype=np.int64,
-    ).reshape(len(device))
+    places = list(zip(layout.source, layout.position, layout.side, strict=True))
+    where: dict[tuple[str, int, int, int], list[int]] = {}
+    for i, (place, q) in enumerate(zip(places, layout.quantity, strict=True)):
+        where.setdefault((*place, int(q)), []).append(i)
+    partner = np.full(len(layout), -1, dtype=np.int64)
+    for (source, position, side, q), rows in where.items():
+        match = where.get((source, position, side, other[q]), [])
+        if len(rows) == len(match) == 1:
+            partner[rows[0]] = match[0]
+    return partner

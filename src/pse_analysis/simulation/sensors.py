@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,16 +156,7 @@ def _with_nominal_limits(network: Network, table: pd.DataFrame, factor: float) -
 
     def nominal(quantity: int) -> FloatArray:
         """|h| at the nominal state, with every channel's quantity replaced."""
-        swapped = SensorLayout(
-            layout.channel,
-            np.full(len(layout), quantity),
-            layout.position,
-            layout.side,
-            layout.scale,
-            layout.sigma,
-            layout.relative,
-            layout.window_s,
-        )
+        swapped = dataclasses.replace(layout, quantity=np.full(len(layout), quantity))
         return np.abs(MeasurementModel(network, swapped).h(x))
 
     power = np.isin(layout.quantity, (P, Q))
