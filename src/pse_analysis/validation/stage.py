@@ -18,7 +18,7 @@ from pse_analysis.validation.criteria import decide
 from pse_analysis.validation.increments import Structure, learn, unwound
 from pse_analysis.validation.rules import Rule, ValidateParams, resolve
 from pse_analysis.validation.timing import Stamps, time_reasons
-from pse_analysis.vocabulary import Reason
+from pse_analysis.vocabulary import Quantity, Reason
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -31,6 +31,8 @@ _DAY = 86_400_000_000
 
 TURNS = {"degree": 360.0, "rad": 2.0 * np.pi}
 """Full turn of an angle in the units it may have."""
+FOLDED = (Quantity.VA_DEGREE, Quantity.IA_DEGREE)
+"""Angles that are known up to full turns; a rotor's is not."""
 
 
 def validate(
@@ -102,7 +104,9 @@ def validate(
 
     statistic, threshold = np.full(len(value), np.nan), np.full(len(value), np.nan)
     sigma, relative = _sigmas(channels, lane_channel)
-    turn = channels["unit"].map(TURNS).fillna(np.inf).to_numpy(dtype=float)[lane_channel]
+    folded = channels["quantity"].isin(FOLDED)
+    turns = channels["unit"].map(TURNS).where(folded).fillna(np.inf).to_numpy(dtype=float)
+    turn = turns[lane_channel]
     for lanes in _alike(stamps.length, lane_rules):
         _screen_lanes(
             lanes, stamps, value, period, lane_rules, history, until, sigma, relative, turn,

@@ -34,6 +34,7 @@ Ints = npt.NDArray[np.int64]
 CHUNK_SAMPLES = 1 << 20
 """Samples worked on at once; what bounds the memory beside the results."""
 
+_CACHED_SAMPLES = 1 << 15
 _NOWHERE = -9.0
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
@@ -114,7 +115,7 @@ class Walk:
     _row: int = field(init=False, default=0)
     _last_time: Array | None = field(init=False, default=None)
     _whole: bool = field(init=False, default=True)
-    _scratch: tuple[Array, Array, Bools] | None = field(init=False, default=None)
+    _scratch: tuple[Array, Bools] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         motion = self.motion
@@ -147,17 +148,13 @@ class Walk:
         """Buffer for the samples of the next chunk, (n, n_channel), NaN where ruled out."""
         return self._work(n)[0][2:]
 
-    def _work(self, n: int) -> tuple[Array, Array, Bools]:
+    def _work(self, n: int) -> tuple[Array, Bools]:
         # Fresh arrays of this size would cost a page fault every 512 samples.
-        if self._scratch is None or len(self._scratch[1]) <= n:
+        if self._scratch is None or len(self._scratch[1]) < n:
             width = len(self.motion.k)
-            self._scratch = (
-                np.empty((n + 2, width)),
-                np.empty((n + 1, width)),
-                np.empty((n, width), dtype=bool),
-            )
-        extended, change, fine = self._scratch
-        return extended[: n + 2], change[: n + 1], fine[:n]
+            self._scratch = (np.empty((n + 2, width)), np.empty((n, width), dtype=bool))
+        extended, fine = self._scratch
+        return extended[: n + 2], fine[:n]
 
     def step(self, chunk: Chunk) -> None:
         """Advance over a chunk, whose values stand in `samples`, and write what is found."""
@@ -179,27 +176,42 @@ class Walk:
 
     def _sieve(self, chunk: Chunk, extended: Array, lead: Array) -> Bools:
         """Which samples are inside their threshold if all before them are ordinary."""
-        scale = chunk.scale
-        limit = self._gamma[None, :] if scale is None else self._gamma * scale
-        _, change, fine = self._work(len(chunk.value))
-        score = np.empty(chunk.value.shape) if chunk.statistic is None else chunk.statistic
-        np.subtract(extended[1:], extended[:-1], out=change)
-        change[0] = lead
-        for lane in np.flatnonzero(np.isfinite(self.motion.turn)):
-            change[:, lane] = shortest(change[:, lane], self.motion.turn[lane])
-        naive = change[1:]
-        # With k = 0 this still spreads a NaN behind, so that "ordinary" means one thing.
-        np.multiply(change[:-1], self._k, out=score)
-        np.subtract(naive, score, out=score)
-        np.abs(score, out=score)
-        np.less_equal(score, limit, out=fine)
+        n, n_channel = chunk.value.shape
+        fine = self._work(n)[1]
+        second = None
         if self._both.any():
             second = np.where(self._both, self.motion.increment_threshold, np.inf)
-            np.abs(change, out=change)
-            # NaN has been dealt with above; here it must not count as exceeding.
-            fine &= ~(naive > (second if scale is None else second * scale))
-        if chunk.threshold is not None:
-            chunk.threshold[...] = limit
+        turning = np.flatnonzero(np.isfinite(self.motion.turn))
+        # Slabs that stay in the processor's cache: the arithmetic is nothing beside the traffic.
+        slab = max(1, _CACHED_SAMPLES // n_channel)
+        change = np.empty((min(slab, n) + 1, n_channel))
+        scores = np.empty((min(slab, n), n_channel))
+        for start in range(0, n, slab):
+            rows = slice(start, min(start + slab, n))
+            size = rows.stop - rows.start
+            moved, score = change[: size + 1], scores[:size]
+            if chunk.statistic is not None:
+                score = chunk.statistic[rows]
+            scale = None if chunk.scale is None else chunk.scale[rows]
+            limit = self._gamma[None, :] if scale is None else self._gamma * scale
+            np.subtract(
+                extended[start + 1 : rows.stop + 2], extended[start : rows.stop + 1], out=moved
+            )
+            if start == 0:
+                moved[0] = lead
+            for lane in turning:
+                moved[:, lane] = shortest(moved[:, lane], self.motion.turn[lane])
+            # With k = 0 this still spreads a NaN behind, so that "ordinary" means one thing.
+            np.multiply(moved[:-1], self._k, out=score)
+            np.subtract(moved[1:], score, out=score)
+            np.abs(score, out=score)
+            np.less_equal(score, limit, out=fine[rows])
+            if second is not None:
+                naive = np.abs(moved[1:], out=moved[1:])
+                # NaN has been dealt with above; here it must not count as exceeding.
+                fine[rows] &= ~(naive > (second if scale is None else second * scale))
+            if chunk.threshold is not None:
+                chunk.threshold[rows] = limit
         return fine
 
     def _mark_uneven(self, fine: Bools, time: Array) -> None:
