@@ -19,7 +19,7 @@ from pse_analysis.parameters import Study, build
 
 NAME = re.compile(r"[a-z0-9_-]+")
 TEXTS = ("title", "grid", "notebook")
-SECTIONS = ("study", "simulate", "validate", "align", "estimate", "score")
+SECTIONS = ("machine", "study", "simulate", "validate", "align", "estimate", "score")
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Case:
     path : Path
         The TOML file.
     grid : str or None
-        Name in `pse_analysis.grid.library`; None if the raw folder brings its own grid.
+        Name in `pse_analysis.grid.library`; None if the raw folder brings its own grid, or if the
+        case is about a machine, whose nameplate is the table ``machine``.
     notebook : str or None
         Notebook that tells the case's story, relative to the project.
     sections : mapping
@@ -147,9 +148,14 @@ def _check(name: str, path: Path, data: dict[str, Any]) -> Case:
     for key in ("title", "study"):
         if key not in data:
             raise ParameterError(f"{path}: {key!r} is missing: add it to the case file")
-    if "simulate" in data and "grid" not in data:
+    if "grid" in data and "machine" in data:
         raise ParameterError(
-            f'{path}: a case with [simulate] needs grid = "NAME", a name of the grid library'
+            f"{path}: a case is about a grid or about a machine: remove grid or [machine]"
+        )
+    if "simulate" in data and "grid" not in data and "machine" not in data:
+        raise ParameterError(
+            f'{path}: a case with [simulate] needs grid = "NAME", a name of the grid library, or a '
+            "table [machine] with a nameplate"
         )
     case = Case(
         name=name,

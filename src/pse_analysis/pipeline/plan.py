@@ -48,7 +48,12 @@ class Stage:
 
 
 STAGES = (
-    Stage("simulate", "pse_analysis.simulation", keys=("grid", "study", "simulate"), leaves=()),
+    Stage(
+        "simulate",
+        "pse_analysis.simulation",
+        keys=("grid", "machine", "study", "simulate"),
+        leaves=(),
+    ),
     Stage(
         "validate",
         "pse_analysis.validation",
@@ -59,21 +64,22 @@ STAGES = (
         "align",
         "pse_analysis.alignment",
         keys=("study", "align"),
-        raw=("grid", "channels.parquet", "truth.parquet"),
+        raw=("grid", "machine.parquet", "channels.parquet", "truth.parquet"),
         tables=(("validate", "validated"),),
     ),
     Stage(
         "estimate",
         "pse_analysis.estimation",
         keys=("study", "estimate"),
-        raw=("grid", "channels.parquet", "truth.parquet"),
+        raw=("grid", "machine.parquet", "channels.parquet", "truth.parquet"),
         tables=(("align", "aligned"),),
     ),
     Stage(
         "score",
         "pse_analysis.scoring",
-        keys=("title", "study", "score"),
-        raw=("grid", "truth.parquet", "faults.parquet"),
+        # What theory says of an observer follows from its tuning and the true densities.
+        keys=("title", "machine", "study", "simulate", "estimate", "score"),
+        raw=("grid", "machine.parquet", "truth.parquet", "faults.parquet"),
         tables=(
             ("validate", "validated"),
             ("estimate", "estimated"),

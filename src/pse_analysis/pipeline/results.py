@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pse_analysis.grid.network import Network
+    from pse_analysis.machine import Machine
     from pse_analysis.pipeline.stages import Parameters
 
 RAW_TABLES = ("telemetry", "channels", "truth", "sample_truth", "faults")
@@ -58,6 +59,13 @@ class Results(Mapping[str, "pd.DataFrame"]):
         from pse_analysis.pipeline.tables import read_network
 
         return read_network(self.raw_folder)
+
+    @property
+    def machine(self) -> Machine:
+        """The machine."""
+        from pse_analysis.pipeline.tables import read_machine
+
+        return read_machine(self.raw_folder)
 
     @property
     def parameters(self) -> Parameters:

@@ -152,8 +152,8 @@ class _Run:
             if not self.raw.occupied:
                 raise TableError(
                     f"no raw data for case {self.case.name!r}: expected {folder} with telemetry/, "
-                    "channels.parquet and grid/; write it with pse_analysis.telemetry.write_raw, "
-                    "or add [simulate] to the case file"
+                    "channels.parquet and grid/ or machine.parquet; write it with "
+                    "pse_analysis.telemetry.write_raw, or add [simulate] to the case file"
                 )
             return self.raw.describe()
         key = fingerprint(

@@ -18,15 +18,22 @@ from pse_analysis.alignment import AlignParams, align
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import EstimateParams, Method, estimate
 from pse_analysis.grid import library
+from pse_analysis.machine import Machine
 from pse_analysis.parameters import Study, build
 from pse_analysis.pipeline.case import Case
 from pse_analysis.pipeline.plan import SUMMARY, Job, Work
 from pse_analysis.pipeline.processes import each
 from pse_analysis.pipeline.summary import markdown, text
-from pse_analysis.pipeline.tables import merge_files, read_network, read_raw_table
-from pse_analysis.scoring import ScoreParams, score
-from pse_analysis.simulation import SimulateParams, profiles, simulate
-from pse_analysis.telemetry import read_raw, read_table, write_raw, write_table
+from pse_analysis.pipeline.tables import merge_files, read_raw_table
+from pse_analysis.scoring import ScoreParams, observers, score
+from pse_analysis.simulation import (
+    MachineSimulateParams,
+    SimulateParams,
+    profiles,
+    simulate,
+    simulate_machine,
+)
+from pse_analysis.telemetry import read_model, read_raw, read_table, write_raw, write_table
 from pse_analysis.validation import ValidateParams, validate
 from pse_analysis.vocabulary import check
 
@@ -38,7 +45,8 @@ class Parameters:
     """What a case file says, as frozen parameters of each stage."""
 
     study: Study
-    simulate: SimulateParams | None
+    machine: Machine | None
+    simulate: SimulateParams | MachineSimulateParams | None
     validate: ValidateParams
     align: AlignParams
     estimate: EstimateParams
@@ -58,10 +66,13 @@ def check_case(case: Case) -> Parameters:
     def part(cls: type[Any], name: str) -> Any:
         return build(cls, sections.get(name, {}), name)
 
+    about_machine = "machine" in sections
+    simulation = MachineSimulateParams if about_machine else SimulateParams
     try:
         parameters = Parameters(
             study=case.study,
-            simulate=part(SimulateParams, "simulate") if case.simulated else None,
+            machine=part(Machine, "machine") if about_machine else None,
+            simulate=part(simulation, "simulate") if case.simulated else None,
             validate=part(ValidateParams, "validate"),
             align=part(AlignParams, "align"),
             estimate=part(EstimateParams, "estimate"),
@@ -80,6 +91,13 @@ def check_case(case: Case) -> Parameters:
 
 def _simulate(job: Job) -> None:
     params = check_case(job.case)
+    if isinstance(params.simulate, MachineSimulateParams):
+        assert params.machine is not None
+        job.progress(0, 2, "moving the machine")
+        raw = simulate_machine(params.machine, params.study, params.simulate)
+        job.progress(1, 2, "writing")
+        write_raw(job.output, raw)
+        return
     assert params.simulate is not None
     assert job.case.grid is not None
     job.progress(0, 3, "reading load profiles")
@@ -116,10 +134,10 @@ def _validate(job: Job) -> None:
 def _align(job: Job) -> None:
     params = check_case(job.case)
     job.progress(0, 4, "reading")
-    network, channels = read_network(job.raw), _channels(job.raw)
+    model, channels = read_model(job.raw), _channels(job.raw)
     validated = read_table(job.inputs["validate"] / "validated.parquet", "validated")
     job.progress(1, 4, "bringing samples to instants")
-    aligned = align(validated, channels, network, params.study, params.align)
+    aligned = align(validated, channels, model, params.study, params.align)
     job.progress(2, 4, "writing")
     write_table(job.output / "aligned.parquet", aligned, "aligned")
     job.progress(3, 4, "recording")
@@ -160,7 +178,7 @@ def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
     done = estimate(
         aligned,
         _channels(task.raw),
-        read_network(task.raw),
+        read_model(task.raw),
         task.study,
         task.method,
         trial=task.trial,
@@ -188,6 +206,19 @@ def _estimate(job: Job) -> None:
         merge_files([task.part(table) for task in tasks], job.output / f"{table}.parquet")
     job.progress(len(tasks), total, "recording")
     tables = {name: read_table(job.output / f"{name}.parquet", name) for name in PARTS}
+    model = read_model(job.raw)
+    if isinstance(model, Machine):
+        recording.machine_estimated(
+            job.output / "estimate.rrd",
+            job.case.name,
+            tables["estimated"],
+            tables["steps"],
+            aligned=read_table(aligned, "aligned"),
+            channels=_channels(job.raw),
+            truth=read_raw_table(job.raw, "truth"),
+            study=params.study,
+        )
+        return
     recording.estimated(
         job.output / "estimate.rrd",
         job.case.name,
@@ -196,7 +227,7 @@ def _estimate(job: Job) -> None:
         tables["residuals"],
         aligned=read_table(aligned, "aligned"),
         channels=_channels(job.raw),
-        network=read_network(job.raw),
+        network=model,
         truth=read_raw_table(job.raw, "truth"),
         study=params.study,
     )
@@ -209,17 +240,43 @@ def _score(job: Job) -> None:
     validated = read_table(job.inputs["validate"] / "validated.parquet", "validated")
     tables = {name: read_table(job.inputs["estimate"] / f"{name}.parquet", name) for name in PARTS}
     job.progress(1, 3, "comparing with the truth")
-    scored = score(tables["estimated"], tables["steps"], validated, truth, faults, params.score)
+    model = read_model(job.raw)
+    expected = (
+        observers.expect(
+            model, params.estimate.methods, params.simulate.densities, params.study.step_s
+        )
+        if isinstance(model, Machine) and isinstance(params.simulate, MachineSimulateParams)
+        else None
+    )
+    scored = score(
+        tables["estimated"],
+        tables["steps"],
+        validated,
+        truth,
+        faults,
+        params.score,
+        expected=expected,
+    )
     write_table(job.output / "scored.parquet", scored, "scored")
     (job.output / SUMMARY).write_text(text(job.case.title, scored), encoding="utf-8")
     job.progress(2, 3, "recording")
+    if isinstance(model, Machine):
+        recording.machine_scored(
+            job.output / "score.rrd",
+            job.case.name,
+            tables["estimated"],
+            truth,
+            summary_markdown=markdown(job.case.title, scored),
+            study=params.study,
+        )
+        return
     recording.scored(
         job.output / "score.rrd",
         job.case.name,
         scored,
         tables["estimated"],
         truth,
-        read_network(job.raw),
+        model,
         summary_markdown=markdown(job.case.title, scored),
         study=params.study,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
+from typing import TypeAlias
 
 import pandas as pd
 from rich import box
@@ -19,6 +20,10 @@ def _mean(values: pd.Series[float]) -> float:
     return float(values.mean())
 
 
+def _rms(values: pd.Series[float]) -> float:
+    return float(values.pow(2).mean() ** 0.5)
+
+
 def _largest(values: pd.Series[float]) -> float:
     return float(values.max())
 
@@ -27,7 +32,9 @@ def _sum(values: pd.Series[float]) -> float:
     return float(values.sum(min_count=1))
 
 
-COLUMNS: tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...] = (
+Columns: TypeAlias = "tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...]"
+
+COLUMNS: Columns = (
     ("vm_error_mean", "|V| error\nmean", _mean, ".3f"),
     ("vm_error_max", "|V| error\nlargest", _largest, ".2f"),
     ("va_error_mean", "∠V error\nmean", _mean, ".1f"),
@@ -40,10 +47,25 @@ COLUMNS: tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...] =
 )
 """Metric, heading, how trials become one number, and format."""
 
-UNITS = "Errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
+MACHINE_COLUMNS: Columns = (
+    ("angle_rms", "θ RMS\n[mrad]", _rms, ".1f"),
+    ("angle_rms_theory", "theory\n[mrad]", _mean, ".1f"),
+    ("angle_settling", "settles\n[s]", _mean, ".2f"),
+    ("speed_rms", "ω RMS\n[mrad/s]", _rms, ".1f"),
+    ("speed_rms_theory", "theory\n[mrad/s]", _mean, ".1f"),
+    ("speed_settling", "settles\n[s]", _mean, ".2f"),
+    ("nis_ratio", "\nNIS/m", _mean, ".3g"),
+    ("coverage_angle", "θ in\n±2σ", _mean, ".1%"),
+    ("steps_not_ok", "steps\nnot ok", _sum, ".0f"),
+)
 
-# Errors are small: shown in thousandths, and angles in degrees, as everywhere a person reads them.
+UNITS = "Errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
+MACHINE_UNITS = "RMS error of rotor angle θ and speed ω, and when it settles into ±2σ of theory"
+
+# Errors are small: shown in thousandths, and angles of buses in degrees, as everywhere a person
+# reads them.
 _SCALE = {"pu": 1e3, "rad": 1e3 * 180.0 / math.pi, "degree": 1e3}
+_MACHINE_SCALE = {"rad": 1e3, "rad/s": 1e3}
 
 
 def text(title: str, scored: pd.DataFrame) -> str:
@@ -57,9 +79,10 @@ def text(title: str, scored: pd.DataFrame) -> str:
         Table of that name; only rows of the whole case (element "") are shown, and trials are
         brought together: largest errors by their maximum, times by their sum, others by their mean.
     """
-    table = Table(title=f"{_title(title, scored)}\n{UNITS}", title_style="", box=box.SIMPLE_HEAD)
+    columns, units, _ = _form(scored)
+    table = Table(title=f"{_title(title, scored)}\n{units}", title_style="", box=box.SIMPLE_HEAD)
     table.add_column("\nmethod", no_wrap=True)
-    for _, heading, _, _ in COLUMNS:
+    for _, heading, _, _ in columns:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in _rows(scored):
         table.add_row(*row)
@@ -73,12 +96,13 @@ def text(title: str, scored: pd.DataFrame) -> str:
 
 def markdown(title: str, scored: pd.DataFrame) -> str:
     """The same for the page of a recording."""
-    head = ["method", *(" ".join(heading.split()) for _, heading, _, _ in COLUMNS)]
-    rule = ["---", *("---:" for _ in COLUMNS)]
+    columns, units, _ = _form(scored)
+    head = ["method", *(" ".join(heading.split()) for _, heading, _, _ in columns)]
+    rule = ["---", *("---:" for _ in columns)]
     lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in _rows(scored)]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
     return "\n".join(
-        [f"# {_title(title, scored)}", "", f"{UNITS}.", "", *table, *lines, "", detection(scored)]
+        [f"# {_title(title, scored)}", "", f"{units}.", "", *table, *lines, "", detection(scored)]
     )
 
 
@@ -106,15 +130,23 @@ def _title(title: str, scored: pd.DataFrame) -> str:
     return f"{title} ({trials} trial{'s' if trials != 1 else ''})"
 
 
+def _form(scored: pd.DataFrame) -> tuple[Columns, str, dict[str, float]]:
+    """Columns, what they say, and scales: those of a machine where there is a rotor's angle."""
+    if (scored["metric"] == "angle_rmse").any():
+        return MACHINE_COLUMNS, MACHINE_UNITS, _MACHINE_SCALE
+    return COLUMNS, UNITS, _SCALE
+
+
 def _rows(scored: pd.DataFrame) -> list[list[str]]:
+    columns, _, scales = _form(scored)
     whole = scored[(scored["element"] == "") & (scored["method"] != "validate")]
     found = []
     for method in dict.fromkeys(whole["method"]):
         own = whole[whole["method"] == method]
         cells = [str(method)]
-        for metric, _, together, form in COLUMNS:
+        for metric, _, together, form in columns:
             rows = own[own["metric"] == metric]
-            scale = rows["unit"].map(_SCALE).fillna(1.0).astype(float)
+            scale = rows["unit"].map(scales).fillna(1.0).astype(float)
             value = together(rows["value"].astype(float) * scale) if len(rows) else math.nan
             cells.append(format(value, form) if math.isfinite(value) else NOTHING)
         found.append(cells)

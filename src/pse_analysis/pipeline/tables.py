@@ -28,6 +28,20 @@ def read_network(raw: Path) -> Network:
     return model
 
 
+def read_machine(raw: Path) -> Machine:
+    """The machine of a raw folder.
+
+    Raises
+    ------
+    TableError
+        If its file is missing or not whole, or the case is about a grid.
+    """
+    model = read_model(raw)
+    if not isinstance(model, Machine):
+        raise TableError(f"{raw} holds the grid {model.name}, not a machine: use read_network")
+    return model
+
+
 def read_raw_table(raw: Path, table: str) -> pd.DataFrame | None:
     """A table of a raw folder; None if it is one that only simulations know and is not there."""
     if table == "telemetry":

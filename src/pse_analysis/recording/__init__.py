@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 from pse_analysis.recording.estimates import estimated, scored
+from pse_analysis.recording.machine import machine_estimated, machine_scored
 from pse_analysis.recording.telemetry import aligned, validated
 
-__all__ = ["aligned", "estimated", "scored", "validated"]
+__all__ = [
+    "aligned",
+    "estimated",
+    "machine_estimated",
+    "machine_scored",
+    "scored",
+    "validated",
+]

@@ -34,6 +34,8 @@ _AXIS = {
     "q_mvar": "Q [p.u.]",
     "i_ka": "|I| [p.u.]",
     "ia_degree": "angle of I [rad]",
+    "rotor_angle_rad": "rotor angle θ [rad]",
+    "delta_m_pu": "ΔM [p.u.]",
 }
 
 
@@ -350,16 +352,17 @@ def _draw_aligned(
     stream: rr.RecordingStream, entity: str, own: pd.DataFrame, true: pd.DataFrame | None
 ) -> None:
     quantity = own.quantity.iloc[0]
-    # Of the true values only |V| has the unit of the aligned ones without knowing the base power.
-    if true is not None and quantity == "vm_pu":
+    # Of a grid's true values only |V| has the unit of the aligned ones without the base power.
+    if true is not None and quantity in ("vm_pu", "rotor_angle_rad"):
         line = true[(true.element == own.element.iloc[0]) & (true.quantity == quantity)]
         frame = pd.DataFrame({"true value": line.value.to_numpy()}, index=line.time_utc)
         marks.lines(stream, f"{entity}/true", frame, [marks.TRUTH], width=2.5)
     for channel, one in own.groupby("channel", sort=False, observed=True):
-        source, *_, last = str(channel).split(":")
-        label = source if last == quantity and ":from:" not in str(channel) else str(channel)
+        source = str(one.source.iloc[0])
+        usual = f"{source}:{one.element.iloc[0]}:{quantity}"
+        label = source if str(channel) == usual else str(channel)
         line = one.set_index("time_utc").sort_index()
-        colour = SOURCES.get(str(one.source.iloc[0]), GREY)
+        colour = SOURCES.get(source, GREY)
         where = marks.entity_path(entity, str(channel))
         marks.band(stream, where, line.value_pu, line.sigma_pu, f"{label} ±σ", colour)
 
@@ -394,7 +397,7 @@ def _aligned_text(
             f"{n_shown} have a lane{some}.",
             marks.markdown_table(head, rows),
             "**Above**, one tab each: values in per unit with their ±σ band, which grows with age."
-            + ("" if true is None else " The grey line is the true voltage."),
+            + ("" if true is None else " The grey line is the true value."),
             "**Middle**: how many channels of each source have a value, and how old it is.",
             "**Below**, a lane per channel: bright green is a new measurement, dark green one that "
             "is used again; a gap means that no value was young enough.",

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import linalg, signal
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.machine import Densities, Machine, Sampled, sample
+from pse_analysis.machine import Densities, Machine, sample
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -204,12 +204,12 @@ def discrete_gain(machine: Machine, tuning: Tuning, step_s: float) -> FloatArray
     require_solvable(A, C, tuning.Q, tuning.R)
     step = sample(machine, tuning, step_s)
     P = linalg.solve_discrete_are(step.F.T, C.T, step.Q, step.R)
-    return filter_gain(P, C, step)
+    return filter_gain(P, C, step.R)
 
 
-def filter_gain(P: FloatArray, C: FloatArray, step: Sampled) -> FloatArray:
+def filter_gain(P: FloatArray, C: FloatArray, R: FloatArray) -> FloatArray:
     """K = P⁻ Cᵀ S⁻¹ of a predicted covariance P⁻."""
-    S = C @ P @ C.T + step.R
+    S = C @ P @ C.T + R
     return np.asarray(linalg.solve(S, C @ P, assume_a="pos").T)
 
 

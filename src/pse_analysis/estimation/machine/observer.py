@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Snapshot
 from pse_analysis.estimation.machine.gain import Poles, Tuning, discrete_gain, filter_gain
-from pse_analysis.machine import Densities, Machine, Sampled, sample
+from pse_analysis.machine import Densities, Machine, sample
 from pse_analysis.vocabulary import Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -97,29 +97,26 @@ def observer(
         raise ParameterError(
             f"method {name!r}: a gain by poles is constant; use gain='constant', or densities"
         )
-    C = machine.C
+    C, eye = machine.C, np.eye(2)
     constant = discrete_gain(machine, tuning, step_s)
+    # The noise of a sample belongs to the telemetry's step, however long ago the last one was.
+    noise = sample(machine, trusted, step_s).R
 
-    def correct(
-        prior: ObserverState, snapshot: Snapshot, K: FloatArray, noise: FloatArray, detail: str
+    def advance(
+        prior: ObserverState, snapshot: Snapshot, detail: str
     ) -> tuple[ObserverState, Info]:
+        if not (snapshot.available[0] and snapshot.fresh[0]):
+            return prior, Info.nothing(1, Status.PREDICTED, detail)
         S = C @ prior.P @ C.T + noise
+        K = constant if gain == "constant" else filter_gain(prior.P, C, noise)
         innovation = snapshot.z - C @ prior.x
-        keep = np.eye(2) - K @ C
+        keep = eye - K @ C
         # Joseph's form holds for any gain, matched or not.
         P = keep @ prior.P @ keep.T + K @ noise @ K.T
         state = ObserverState(prior.time, prior.x + K @ innovation, P, prior.u)
         nis = float(innovation[0] ** 2 / S[0, 0])
         used, deviation = np.ones(1, dtype=bool), np.sqrt(np.diagonal(S))
         return state, Info(Status.OK, 1, nis, 1, used, innovation, deviation, np.zeros(1), detail)
-
-    def advance(
-        prior: ObserverState, snapshot: Snapshot, step: Sampled, detail: str
-    ) -> tuple[ObserverState, Info]:
-        if not (snapshot.available[0] and snapshot.fresh[0]):
-            return prior, Info.nothing(1, Status.PREDICTED, detail)
-        K = constant if gain == "constant" else filter_gain(prior.P, C, step)
-        return correct(prior, snapshot, K, step.R, detail)
 
     def init(snapshot: Snapshot) -> tuple[ObserverState | None, Info]:
         if snapshot.inputs is None:
@@ -130,7 +127,7 @@ def observer(
             np.diag(np.square(start_sigma)),
             float(snapshot.inputs[0]),
         )
-        return advance(prior, snapshot, sample(machine, trusted, step_s), "")
+        return advance(prior, snapshot, "")
 
     def step(state: ObserverState, snapshot: Snapshot) -> tuple[ObserverState, Info]:
         elapsed = (snapshot.time - state.time) / np.timedelta64(1, "us") * 1e-6
@@ -149,8 +146,7 @@ def observer(
             over.F @ state.P @ over.F.T + over.Q,
             u,
         )
-        # The noise of a sample belongs to the telemetry's step, however long ago the last one was.
-        return advance(prior, snapshot, over._replace(R=trusted.R / step_s), detail)
+        return advance(prior, snapshot, detail)
 
     def read(state: ObserverState) -> Estimate:
         return Estimate(state.x, state.P)
