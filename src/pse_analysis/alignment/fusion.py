@@ -172,6 +172,8 @@ def _usable_in_order(validated: pd.DataFrame, column: IntArray, layout: SensorLa
     time = _microseconds(rows["time_utc"])
     came = rows["arrival_utc"].isna().to_numpy()
     arrival = np.where(came, time, _microseconds(rows["arrival_utc"].fillna(rows["time_utc"])))
+    # A stamp ahead of its arrival, from a clock that is fast or wrong, waits for its time.
+    arrival = np.maximum(arrival, time)
     order = np.lexsort((rows["seq"].to_numpy(), arrival, place, trial))
     _, group = np.unique(np.stack([trial, place]), axis=1, return_inverse=True)
     group = np.ravel(group)[order].astype(np.int64)
