@@ -78,7 +78,8 @@ def write(results: list[Row]) -> None:
     ]
     for r in results:
         peer = f"{seconds(r.peer_s)} ({r.peer})"
-        lines.append(f"| {r.what} | {seconds(r.ours_s)} | {peer} | {times(r)} | {r.note} |")
+        cells = (r.what, seconds(r.ours_s), peer, times(r), r.note)
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     text = README.read_text(encoding="utf-8")
     head, rest = text.split(BEGIN)
     tail = rest.split(END)[1]
