@@ -35,6 +35,7 @@ def voltage(
     aligned: pd.DataFrame | None,
     element: str,
     *,
+    channels: pd.DataFrame | None = None,
     methods: Sequence[str] | None = None,
     quantity: str = "vm_pu",
     trial: int = 0,
@@ -48,6 +49,9 @@ def voltage(
         Tables of these names; `truth` and `aligned` may be None.
     element : str
         Such as ``bus/18``.
+    channels : DataFrame, optional
+        Table ``channels``, which tells what is measured where; without it channels are known by
+        their names, ``source:element:quantity``.
     methods : sequence of str, optional
         Methods to draw; default: all.
     quantity : str
@@ -83,11 +87,12 @@ def voltage(
         true = true[true.quantity == quantity].sort_values("time_utc")
         ax.plot(true.time_utc, true.value, color=TRUTH, lw=1.0, ls=(0, (4, 1.5)), label="true")
     if aligned is not None:
-        ends = aligned.channel.str.endswith(f":{element}:{quantity}")
+        source = _sources(aligned.channel, channels, element, quantity)
         inside = aligned.time_utc.between(own.time_utc.min(), own.time_utc.max())
-        seen = aligned[ends & inside & (aligned.trial == trial) & (aligned.origin == "measured")]
+        fresh = (aligned.trial == trial) & (aligned.origin == "measured")
+        seen = aligned.assign(source=source)[source.notna() & inside & fresh]
         scale = 180.0 / np.pi if quantity == "va_degree" else 1.0
-        for source, part in seen.groupby(seen.channel.str.split(":").str[0], sort=False):
+        for source, part in seen.groupby("source", sort=False):
             colour = SOURCES.get(str(source), MEASURED)
             label = f"measured, {source}"
             ax.plot(part.sample_utc, scale * part.value_pu, ".", ms=3, color=colour, label=label)
@@ -96,6 +101,17 @@ def voltage(
     time_axis(ax, width)
     legend(figure, ax)
     return figure
+
+
+def _sources(
+    named: pd.Series, channels: pd.DataFrame | None, element: str, quantity: str
+) -> pd.Series:
+    """Source of the channels that measure a quantity of an element, NaN for all others."""
+    if channels is None:
+        ends = named.str.endswith(f":{element}:{quantity}")
+        return named.str.split(":").str[0].where(ends)
+    own = channels[(channels.element == element) & (channels.quantity == quantity)]
+    return named.map(dict(zip(own.channel, own.source, strict=True)))
 
 
 @styled
