@@ -168,8 +168,12 @@ def estimate(
             f"trials {sorted(set(aligned['trial']))}"
         )
     layout = SensorLayout.from_channels(channels, model)
-    whole = record(rows, layout)
-    start = pd.Timestamp(study.start).tz_convert("UTC").tz_localize(None).to_datetime64()
+    start, end = (
+        pd.Timestamp(t).tz_convert("UTC").tz_localize(None).to_datetime64().astype("datetime64[us]")
+        for t in (study.start, study.end)
+    )
+    step = np.timedelta64(round(study.step_s * 1e6), "us")
+    whole = record(rows, layout, np.arange(start, end, step))
     studied = whole.between(start, None)
     if isinstance(model, Machine):
         estimator = _build_observer(method, model, study)

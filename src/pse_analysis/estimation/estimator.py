@@ -212,15 +212,28 @@ class Record:
         )
 
 
-def record(aligned: pd.DataFrame, layout: SensorLayout) -> Record:
+def record(
+    aligned: pd.DataFrame,
+    layout: SensorLayout,
+    instants: npt.NDArray[np.datetime64] | None = None,
+) -> Record:
     """Arrays from the aligned table of one trial and variant.
+
+    Parameters
+    ----------
+    aligned : DataFrame
+    layout : SensorLayout
+    instants : (T,) ndarray of datetime64, optional
+        Instants that are there even if no sample is; a filter has to pass through them.
 
     Raises
     ------
     TableError
         If a channel is not in the layout, or a row stands twice.
     """
-    times, row = np.unique(_utc(aligned["time_utc"]), return_inverse=True)
+    stamps = _utc(aligned["time_utc"])
+    times = np.unique(stamps if instants is None else np.concatenate([stamps, instants]))
+    row = np.searchsorted(times, stamps)
     column = pd.Index(layout.channel).get_indexer(aligned["channel"])
     if (column < 0).any():
         name = aligned["channel"].iloc[int(np.argmin(column))]
@@ -310,7 +323,9 @@ def run(
         state, info = estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
         seconds = time.perf_counter() - begun
         estimate = None if state is None else estimator.read(state)
-        if estimate is not None and not np.isfinite(estimate.x).all():
+        if estimate is not None and not (
+            np.isfinite(estimate.x).all() and np.isfinite(np.diagonal(estimate.covariance)).all()
+        ):
             estimate, state = None, None
             info = Info.nothing(
                 len(layout), Status.DIVERGED, "the state is not finite: it restarts next instant"
