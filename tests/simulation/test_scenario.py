@@ -16,7 +16,12 @@ from pse_analysis.grid import library, power_flow
 from pse_analysis.grid.network import BusKind
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 from pse_analysis.simulation import scenario
-from pse_analysis.simulation.settings import LoadParams, PvParams, SourceVoltageParams
+from pse_analysis.simulation.settings import (
+    LoadParams,
+    LoadStepParams,
+    PvParams,
+    SourceVoltageParams,
+)
 
 SEED = 7
 
@@ -154,3 +159,25 @@ def test_states_found_with_one_jacobian_are_those_of_newton_from_a_flat_start(gr
     solved = scenario._solve(network, np.arange(12), p, q, vm_set)
     exact = power_flow.solve(network, p, q, vm_set, tolerance=1e-12)
     np.testing.assert_allclose(solved.x, exact.x, atol=1e-7)
+
+
+def test_load_steps_move_the_named_loads_and_leave_everything_else_as_it_was():
+    steps = LoadStepParams(per_day=48.0, size=(0.3, 0.6), at=("18", "25"))
+    _, without = truth()
+    _, stepped = truth(params=dataclasses.replace(PARAMS, load_steps=steps))
+    moved = np.abs(stepped.p_pu - without.p_pu).max(axis=1) > 1e-9
+    named = np.isin(np.arange(feeder().n_bus), [feeder().bus(b) for b in steps.at])
+    slack = np.arange(feeder().n_bus) == feeder().slack
+    np.testing.assert_array_equal(moved[~slack], named[~slack])
+
+
+def test_a_load_step_lasts_as_long_as_stated():
+    params = LoadStepParams(per_day=20.0, size=(0.5, 0.5), duration_s=(600.0, 600.0))
+    jumps = scenario.load_steps((3, 1440), 60.0, params, np.random.default_rng(SEED))
+    change = np.diff(jumps, axis=1, prepend=0.0)
+    assert np.abs(change).any()
+    # What steps up and what steps back ten points later cancel.
+    np.testing.assert_allclose(np.cumsum(change, axis=1), jumps)
+    single = scenario.load_steps((1, 1440), 60.0, params, np.random.default_rng(3))[0]
+    assert set(np.unique(np.abs(single)).round(6)) <= {0.0, 0.5, 1.0, 1.5}
+    assert (single != 0).sum() <= 10 * np.count_nonzero(np.diff(single, prepend=0.0))

@@ -16,7 +16,12 @@ from pse_analysis.grid.network import BusKind, Network
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.simulation.profiles import PROFILE_STEP_S, ar1, between, bridge, column
-from pse_analysis.simulation.settings import LoadParams, SimulateParams, SourceVoltageParams
+from pse_analysis.simulation.settings import (
+    LoadParams,
+    LoadStepParams,
+    SimulateParams,
+    SourceVoltageParams,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -163,6 +168,25 @@ def source_voltage(
     return slow + params.tap_pu * position
 
 
+def load_steps(
+    shape: tuple[int, int], step_s: float, params: LoadStepParams, rng: np.random.Generator
+) -> FloatArray:
+    """Deviation of loads, (n_load, n_point), by steps that end after a while, relative to nominal.
+
+    The reactive load follows at the power factor that the load has.
+    """
+    n_load, n_point = shape
+    out = np.zeros((n_load, n_point + 1))
+    for row, count in enumerate(rng.poisson(params.per_day * n_point * step_s / 86400.0, n_load)):
+        size = rng.uniform(*params.size, count) * rng.choice((-1.0, 1.0), count)
+        begin = rng.integers(0, n_point, count)
+        lasting = np.maximum(np.rint(rng.uniform(*params.duration_s, count) / step_s), 1)
+        end = np.minimum(begin + lasting.astype(np.int64), n_point)
+        np.add.at(out[row], begin, size)
+        np.add.at(out[row], end, -size)
+    return np.asarray(np.cumsum(out[:, :-1], axis=1))
+
+
 def draw_truth(
     network: Network,
     profiles: pd.DataFrame,
@@ -185,7 +209,7 @@ def draw_truth(
     ParameterError
         If the curves do not cover the study.
     """
-    load_rng, pv_rng, source_rng = (np.random.default_rng(s) for s in seed.spawn(3))
+    load_rng, pv_rng, source_rng, step_rng = (np.random.default_rng(s) for s in seed.spawn(4))
     start, end = (pd.Timestamp(int(t), unit="us", tz="UTC") for t in (time[0], time[-1]))
     index = between(profiles, start, end).index
     k = round(PROFILE_STEP_S / params.truth_step_s)
@@ -207,6 +231,13 @@ def draw_truth(
     p_shape = bridge(mix.p, shared, rho1=load.rho1, window=load.window, scale="log")[:, window]
     q_normal = r * shared + np.sqrt(1 - r**2) * own
     q_shape = bridge(mix.q, q_normal, rho1=load.rho1, window=load.window)[:, window]
+    if params.load_steps.per_day:
+        jumps = load_steps(p_shape.shape, params.truth_step_s, params.load_steps, step_rng)
+        if params.load_steps.at:
+            jumps[~np.isin(mix.bus, [network.bus(b) for b in params.load_steps.at])] = 0.0
+        # A load cannot be switched off twice: what steps down leaves a tenth.
+        p_stepped = np.maximum(p_shape + jumps, 0.1 * p_shape)
+        q_shape, p_shape = q_shape * p_stepped / p_shape, p_stepped
     p_load = np.zeros((network.n_bus, len(time)))
     q_load = np.zeros_like(p_load)
     p_load[mix.bus] = buses.p_load_mw[mix.bus, None] * p_shape

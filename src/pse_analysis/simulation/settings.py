@@ -83,6 +83,35 @@ class SourceVoltageParams:
 
 
 @dataclass(frozen=True)
+class LoadStepParams:
+    """Steps of single loads, as machines, pumps and tariff switches make them.
+
+    Attributes
+    ----------
+    per_day
+        Mean number of steps of each load. [1/day]
+    size
+        Range of a step, relative to the nominal load; up or down with equal odds.
+    duration_s
+        Range of the time until the load steps back. [s]
+    at
+        Names of the buses whose loads step; empty for all.
+    """
+
+    per_day: float = 0.0
+    size: tuple[float, float] = (0.1, 0.3)
+    duration_s: tuple[float, float] = (600.0, 5400.0)
+    at: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = "simulate.load_steps"
+        _require(self.per_day >= 0, where, "per_day ≥ 0", self.per_day)
+        for name in ("size", "duration_s"):
+            low, high = getattr(self, name)
+            _require(0 < low <= high, where, f"{name} = [low, high], 0 < low ≤ high", (low, high))
+
+
+@dataclass(frozen=True)
 class PvParams:
     """A PV plant at unity power factor: bus name, rated power [MW] and its curve."""
 
@@ -165,14 +194,15 @@ class FaultParams:
     Attributes
     ----------
     kind
-        ``spike``, ``stale``, ``lost``, ``duplicated`` or ``delayed``.
+        ``spike``, ``stale``, ``lost``, ``duplicated``, ``delayed`` or ``empty`` (a telegram without
+        a value).
     rate
         Share of the samples concerned (for ``stale``: of samples inside episodes), on average.
     size
         Range from which the size is drawn uniformly; its meaning follows the kind:
         spike: multiples of the channel's σ, or of the true magnitude if ``relative``, of random
         sign; stale: length of an episode [s]; duplicated: how much later the copy arrives [s];
-        delayed: how much later than usual the sample arrives [s]; lost: unused.
+        delayed: how much later than usual the sample arrives [s]; lost, empty: unused.
     relative
         Whether the size of spikes is relative to the true magnitude.
     source, quantities, at
@@ -197,7 +227,7 @@ class FaultParams:
         _require(self.kind in kinds, where, f"kind in {', '.join(kinds)}", self.kind)
         _require(0 <= self.rate <= 1, where, "rate in 0 … 1", self.rate)
         low, high = self.size
-        needs_size = self.kind != FaultKind.LOST
+        needs_size = self.kind not in (FaultKind.LOST, FaultKind.EMPTY)
         _require(
             (0 < low <= high) if needs_size else True,
             where,
@@ -230,6 +260,7 @@ class SimulateParams:
     trials: int = 1
     truth_step_s: float = 60.0
     load: LoadParams = field(default_factory=LoadParams)
+    load_steps: LoadStepParams = field(default_factory=LoadStepParams)
     source_voltage: SourceVoltageParams = field(default_factory=SourceVoltageParams)
     pv: tuple[PvParams, ...] = ()
     faults: tuple[FaultParams, ...] = ()
