@@ -38,8 +38,9 @@ def of_faults(validated: pd.DataFrame, faults: pd.DataFrame) -> pd.DataFrame:
         mine = hit[hit["trial"] == trial]
         own = faulty["trial"] == trial
         alarms = int((alarmed & own).sum())
-        rows.extend((trial, name, "", value) for name, value in _counts(mine["found"]))
-        found = int(mine["found"].sum())
+        once = mine.drop_duplicates(KEY)["found"]  # a sample may have several faults
+        rows.extend((trial, name, "", value) for name, value in _counts(once))
+        found = int(once.sum())
         flagged = found + alarms
         rows.append((trial, "false_alarms", "", float(alarms)))
         rows.append((trial, "precision", "", found / flagged if flagged else float("nan")))
