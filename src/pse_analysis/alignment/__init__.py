@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from pse_analysis.alignment.fusion import AlignParams, align
+from pse_analysis.alignment import dtw, pseudo_measurements, stamps
+from pse_analysis.alignment.fusion import AlignParams, Variant, align
 
-__all__ = ["AlignParams", "align"]
+__all__ = ["AlignParams", "Variant", "align", "dtw", "pseudo_measurements", "stamps"]

@@ -1,0 +1,300 @@
+"""Sampling times for a table of telemetry: devices without a clock and their partners."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from pse_analysis.alignment import dtw
+from pse_analysis.alignment.dtw import METHODS, Method, Reference, TimeParams
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import BUS, IM, TO, P, Q, SensorLayout, standard_deviation
+from pse_analysis.vocabulary import usable
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+MICROSECOND = 1_000_000
+ALONE = 0.5
+"""Correlation that a partner must show which is not in series with the device."""
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingTimes:
+    """When the samples of a telemetry table were taken, row by row.
+
+    Attributes
+    ----------
+    time : (n,) ndarray of int64
+        Microseconds since 1970 UTC.
+    confidence : (n,) ndarray
+        1 where the stamp is the source's own and nothing was asked; else from
+        `pse_analysis.alignment.dtw.Stamps`.
+    method : (n,) ndarray of int8
+        Index into `pse_analysis.alignment.dtw.METHODS`.
+    partner : dict of str to str
+        Channel that each device was matched with; absent where there is none.
+    """
+
+    time: IntArray
+    confidence: FloatArray
+    method: npt.NDArray[np.int8]
+    partner: dict[str, str]
+
+
+def sampling_times(
+    validated: pd.DataFrame,
+    layout: SensorLayout,
+    source: npt.NDArray[np.object_],
+    network: Network,
+    instants: IntArray,
+    study_start: int,
+    params: TimeParams | None = None,
+    method: Method = "dtw",
+) -> SamplingTimes:
+    """Recover the sampling times of devices that stamp by arrival.
+
+    Parameters
+    ----------
+    validated : DataFrame
+        Table ``validated``.
+    layout : SensorLayout
+        Of all channels.
+    source : (m,) ndarray of str
+        Source of every row of the layout.
+    network : Network
+    instants : (T,) ndarray of int64
+        A stamp is settled at the first instant after the arrival. [µs]
+    study_start : int
+        Partners are chosen on what arrived before it. [µs]
+    params : TimeParams, optional
+    method : {"none", "xcorr", "dtw"}
+
+    Returns
+    -------
+    SamplingTimes
+
+    Notes
+    -----
+    Only samples of ``params.sources`` whose stamp is their arrival change. All channels of one
+    device share its delays, because they arrive together.
+    """
+    params = params or TimeParams()
+    n = len(validated)
+    stamp, arrival = (_microseconds(validated[c]) for c in ("time_utc", "arrival_utc"))
+    out = SamplingTimes(stamp.copy(), np.ones(n), np.zeros(n, dtype=np.int8), {})
+    if method == "none" or not n:
+        return out
+    column = pd.Index(layout.channel).get_indexer(validated["channel"])
+    clockless = np.isin(source, params.sources)[column] & (stamp == arrival)
+    trial = validated["trial"].to_numpy()
+    device = pd.factorize(
+        pd.Series(layout.channel).str.rsplit(":", n=1).str[0].to_numpy(dtype=object)
+    )[0]
+    value = validated["corrected"].to_numpy(dtype=float) * layout.scale[column]
+    good = usable(validated["flag"].to_numpy()) & np.isfinite(value)
+    seconds = (instants - instants[0]) / MICROSECOND
+    chosen: dict[int, list[int]] = {}
+    for number in np.unique(trial):
+        mine = trial == number
+        references = _references(layout, source, column, stamp, arrival, value, mine & good)
+        for place in np.unique(device[column[mine & clockless]]):
+            rows = np.flatnonzero(mine & clockless & (device[column] == place))
+            came, current, sigma = _current(layout, column, arrival, value, rows[good[rows]])
+            base = int(instants[0])
+            when = (came - base) / MICROSECOND
+            if place not in chosen:
+                spot = int(column[rows[0]])
+                chosen[place] = _ranked(
+                    network, layout, spot, references, when, current, params,
+                    (study_start - base) / MICROSECOND, base,
+                )  # fmt: skip
+            out.confidence[rows] = 0.0
+            if not chosen[place] or not len(came):
+                continue
+            name = layout.channel[int(column[rows[0]])].rsplit(":", 1)[0]
+            partner = chosen[place][0]
+            out.partner[name] = layout.channel[partner]
+            if partner not in references:
+                continue
+            found = dtw.recover(
+                when, current, sigma, _shifted(references[partner], base), seconds, params, method
+            )
+            at = np.clip(np.searchsorted(came, arrival[rows], side="right") - 1, 0, None)
+            same = came[at] == arrival[rows]
+            # A sample whose other half was lost has no current: the device's last delay will do.
+            out.time[rows] = arrival[rows] - np.rint(found.delay[at] * MICROSECOND).astype(np.int64)
+            out.confidence[rows] = np.where(same, found.confidence[at], 0.0)
+            out.method[rows] = np.where(same, found.method[at], np.minimum(found.method[at], 1))
+    return out
+
+
+def rms_errors(
+    times: SamplingTimes, validated: pd.DataFrame, sample_truth: pd.DataFrame, since: pd.Timestamp
+) -> pd.DataFrame:
+    """RMS time error of recovered stamps against the true sampling times.
+
+    Parameters
+    ----------
+    times : SamplingTimes
+    validated, sample_truth : DataFrame
+        Tables of these names.
+    since : Timestamp
+        Only samples that arrived from then on.
+
+    Returns
+    -------
+    DataFrame
+        ``device``, ``method`` that the stamp rests on, ``count``, ``rms_s`` of it and ``arrival_s``
+        of the arrival taken for the sampling time; devices that stamp themselves are left out.
+    """
+    key = ["trial", "channel", "seq"]
+    frame = validated[[*key, "arrival_utc"]].assign(
+        time=times.time, how=np.array(METHODS, dtype=object)[times.method], sure=times.confidence
+    )
+    frame["device"] = frame["channel"].str.rsplit(":", n=1).str[0]
+    frame = frame[frame["device"].isin(times.partner) & (frame["arrival_utc"] >= since)]
+    frame = frame.merge(sample_truth[[*key, "time_utc"]], on=key)
+    true = _microseconds(frame["time_utc"])
+    frame["error"] = (frame["time"] - true) / MICROSECOND
+    frame["late"] = (_microseconds(frame["arrival_utc"]) - true) / MICROSECOND
+    grouped = frame.groupby(["device", "how"], sort=True)
+    return pd.DataFrame(
+        {
+            "count": grouped.size(),
+            "rms_s": grouped["error"].apply(_rms),
+            "arrival_s": grouped["late"].apply(_rms),
+        }
+    ).reset_index(names=["device", "method"])
+
+
+def _rms(values: pd.Series) -> float:
+    return float(np.sqrt(np.mean(values.to_numpy(dtype=float) ** 2)))
+
+
+def _microseconds(times: pd.Series) -> IntArray:
+    return np.asarray(
+        times.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy().astype("datetime64[us]")
+    ).astype(np.int64)
+
+
+def _references(
+    layout: SensorLayout,
+    source: npt.NDArray[np.object_],
+    column: IntArray,
+    stamp: IntArray,
+    arrival: IntArray,
+    value: FloatArray,
+    rows: npt.NDArray[np.bool_],
+) -> dict[int, Reference]:
+    """Currents of the phasor units of one trial, by row of the layout; times in µs."""
+    out = {}
+    for place in np.flatnonzero((source == "pmu") & (layout.quantity == IM) & (layout.side != BUS)):
+        own = np.flatnonzero(rows & (column == place))
+        own = own[np.argsort(stamp[own], kind="stable")]
+        own = own[np.append(True, np.diff(stamp[own]) > 0)] if len(own) else own
+        if len(own) >= dtw.FEWEST_FOR_LAG:
+            out[int(place)] = Reference.of(
+                stamp[own].astype(float), arrival[own].astype(float), value[own]
+            )
+    return out
+
+
+def _shifted(reference: Reference, base: int) -> Reference:
+    """The reference in seconds since a base in µs."""
+    return Reference(
+        (reference.time - base) / MICROSECOND,
+        (reference.known - base) / MICROSECOND,
+        reference.value,
+    )
+
+
+def _current(
+    layout: SensorLayout, column: IntArray, arrival: IntArray, value: FloatArray, rows: IntArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Arrivals of a device, its current magnitude and σ: measured, or apparent power at 1 p.u."""
+    wide = pd.DataFrame(
+        {"at": arrival[rows], "kind": layout.quantity[column[rows]], "value": value[rows]}
+    ).pivot_table(index="at", columns="kind", values="value", aggfunc="first")
+    some = layout.sigma[column[rows[:1]]], layout.relative[column[rows[:1]]]
+    if IM in wide:
+        whole = wide[IM].dropna()
+        current = whole.to_numpy()
+        return whole.index.to_numpy(np.int64), current, standard_deviation(current, *some)
+    if P not in wide or Q not in wide:
+        return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
+    whole = wide[[P, Q]].dropna()
+    power = whole.to_numpy()
+    size = np.maximum(np.hypot(*power.T), 1e-9)
+    sigma = np.hypot(*(power * standard_deviation(power, *some)).T) / size
+    return whole.index.to_numpy(np.int64), size, np.maximum(sigma, 1e-9)
+
+
+def _ranked(
+    network: Network,
+    layout: SensorLayout,
+    spot: int,
+    references: dict[int, Reference],
+    when: FloatArray,
+    current: FloatArray,
+    params: TimeParams,
+    until: float,
+    base: int,
+) -> list[int]:
+    """Phasor currents in the order in which they suit a device.
+
+    Those in series with it, the source feeding one through the other, come first, then those that
+    correlate by at least `ALONE`; among equals the one whose increments correlate best, at the best
+    lag, in the history.
+    """
+    if not references:
+        return []
+    past = when < until
+    past = past if past.sum() > dtw.FEWEST_FOR_LAG else np.ones(len(when), dtype=bool)
+    feeding = _feeding(network)
+    own = _far_end(network, layout, spot, feeding)
+    rank = {}
+    for place, reference in references.items():
+        far = _far_end(network, layout, place, feeding)
+        series = far in feeding[own] or own in feeding[far]
+        found = dtw.correlation(when[past], current[past], _shifted(reference, base), params)
+        if series or found >= ALONE:
+            rank[place] = (not series, -found)
+    return sorted(rank, key=lambda place: rank[place])
+
+
+def _feeding(network: Network) -> list[set[int]]:
+    """Buses on the shortest way from the slack to each bus, itself included."""
+    neighbours: list[list[int]] = [[] for _ in range(network.n_bus)]
+    for a, b, on in zip(
+        network.branches.from_bus,
+        network.branches.to_bus,
+        network.branches.in_service,
+        strict=True,
+    ):
+        if on:
+            neighbours[a].append(int(b))
+            neighbours[b].append(int(a))
+    way: list[set[int]] = [set() for _ in range(network.n_bus)]
+    way[network.slack] = {network.slack}
+    queue = deque([network.slack])
+    while queue:
+        bus = queue.popleft()
+        for other in neighbours[bus]:
+            if not way[other]:
+                way[other] = {*way[bus], other}
+                queue.append(other)
+    return way
+
+
+def _far_end(network: Network, layout: SensorLayout, row: int, feeding: list[set[int]]) -> int:
+    """The end of a metered branch that lies farther from the source; the bus of a bus."""
+    place = int(layout.position[row])
+    if layout.side[row] == BUS:
+        return place
+    ends = int(network.branches.from_bus[place]), int(network.branches.to_bus[place])
+    return max(ends, key=lambda bus: (len(feeding[bus]), layout.side[row] == TO))
