@@ -35,7 +35,11 @@ PURPLE = "#CC79A7"
 GREY = "#8C8C8C"
 
 METHODS: MappingProxyType[str, str] = MappingProxyType(
-    {"wls": ORANGE, "kf_scalar": GREEN, "kf_load": BLUE}
+    {
+        **{"wls": ORANGE, "kf_scalar": GREEN, "kf_load": BLUE},
+        **{"case_1": VERMILION, "case_2": SKY, "case_3": GREEN},
+        **{"matched": BLUE, "luenberger": PURPLE},
+    }
 )
 """Colours of the methods that most cases run."""
 

@@ -17,6 +17,7 @@ from pse_analysis.estimation.machine import (
     discrete_gain,
     observe,
     observer,
+    simulated_rms,
 )
 from pse_analysis.machine import Densities, Machine
 from pse_analysis.simulation.machine import (
@@ -40,22 +41,15 @@ OBSERVERS: dict[str, Tuning] = {
 }
 
 
-@pytest.mark.parametrize("name", OBSERVERS)
-def test_simulated_error_is_the_discrete_lyapunov_prediction(name: str) -> None:
+def test_simulated_error_is_the_discrete_lyapunov_prediction_for_all_observers() -> None:
     """48 starts from the stationary law, then 60 s each through plant and observer."""
-    trials, steps = 48, 6000
-    rng = np.random.default_rng(20250803)
-    K = discrete_gain(MACHINE, OBSERVERS[name], STEP_S)
-    P = discrete_covariance(MACHINE, K, TRUE, STEP_S)
-    drawn = disturb(MACHINE, TRUE, STEP_S, steps, trials, rng)
-    start = np.linalg.cholesky(P) @ rng.standard_normal((2, trials))
-    quiet = np.zeros((steps + 1, 1))
-    y = drawn.x[1:, 0] + drawn.noise[1:]
-    error = observe(MACHINE, K, STEP_S, y, quiet, start) - drawn.x[1:]
-    power = (error**2).mean(axis=0)  # per state and trial
-    standard_error = power.std(axis=1, ddof=1) / np.sqrt(trials)
-    assert (np.abs(power.mean(axis=1) - np.diagonal(P)) < 3.0 * standard_error).all()
-    assert (standard_error < 0.2 * np.diagonal(P)).all()
+    found = simulated_rms(
+        MACHINE, OBSERVERS, TRUE, STEP_S, duration_s=60.0, trials=48, seed=20250803
+    )
+    assert list(found) == list(OBSERVERS)
+    for name, (rms, standard_error, theory) in found.items():
+        assert (np.abs(rms - theory) < 3.0 * standard_error).all(), name
+        assert (standard_error < 0.1 * theory).all(), name
 
 
 def test_simulated_error_is_least_at_the_true_ratio() -> None:

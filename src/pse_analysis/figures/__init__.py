@@ -7,6 +7,7 @@ global state.
 
 from __future__ import annotations
 
+from pse_analysis.figures import machine
 from pse_analysis.figures.one_line import grid
 from pse_analysis.figures.paper import DOUBLE, SINGLE, Paper
 from pse_analysis.figures.scores import (
@@ -28,6 +29,7 @@ __all__ = [
     "errors_by_bus",
     "flags",
     "grid",
+    "machine",
     "score_table",
     "voltage",
 ]

@@ -12,6 +12,7 @@ from pse_analysis.estimation.machine.gain import (
 )
 from pse_analysis.estimation.machine.observer import ObserverState, observe, observer
 from pse_analysis.estimation.machine.study import ObserverParams, from_params, snapshots
+from pse_analysis.estimation.machine.trials import Simulated, simulated_rms
 from pse_analysis.estimation.machine.tuning import (
     ModelError,
     Tuned,
@@ -28,6 +29,7 @@ __all__ = [
     "ObserverParams",
     "ObserverState",
     "Poles",
+    "Simulated",
     "Tuned",
     "Tuning",
     "continuous_covariance",
@@ -42,6 +44,7 @@ __all__ = [
     "observer",
     "require_solvable",
     "rms",
+    "simulated_rms",
     "snapshots",
     "tune",
 ]
