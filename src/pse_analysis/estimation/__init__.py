@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import machine, process
+from pse_analysis.estimation import composition, machine, process
+from pse_analysis.estimation.composition import Composition
 from pse_analysis.estimation.estimator import Estimated, Estimator, Record, States, record, run
 from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.wls import tracking_wls
+from pse_analysis.estimation.noise import of_grid
+from pse_analysis.estimation.wls import state_columns, tracking_wls
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.measurement import Model, SensorLayout
@@ -30,15 +32,18 @@ class Method:
     ----------
     name : str
         Spelling in tables and figures.
-    filter : {"wls", "kalman", "observer"}
-        ``observer`` is a machine's, the others are a grid's.
+    filter : {"wls", "kalman", "ukf", "ekf", "observer"}
+        ``observer`` is a machine's, the others are a grid's. ``kalman`` is linear in rectangular
+        coordinates, ``ukf`` and ``ekf`` are polar.
     noise : {"load", "scalar"}
         Process noise of a filter.
     variance : float
-        q of ``scalar`` noise, per step. [p.u.²]
+        q of ``scalar`` noise, per step. [p.u.², rad²]
     source_sigma : float, optional
         σ of the source voltage's change per step for ``load`` noise; learnt from history if not
         given. [p.u.]
+    compose : Composition
+        What a ``ukf`` or ``ekf`` is made of.
     observer : ObserverParams, optional
         What an ``observer`` is designed from.
     variant : str
@@ -46,14 +51,20 @@ class Method:
     """
 
     name: str
-    filter: Literal["wls", "kalman", "observer"]
+    filter: Literal["wls", "kalman", "ukf", "ekf", "observer"]
     noise: Literal["load", "scalar"] = "load"
     variance: float = 1e-6
     source_sigma: float | None = None
+    compose: Composition = field(default_factory=Composition)
     observer: machine.ObserverParams | None = None
     variant: str = "last"
 
     def __post_init__(self) -> None:
+        if self.filter not in ("ukf", "ekf") and self.compose != Composition():
+            raise ParameterError(
+                f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, not for "
+                f"{self.filter}: drop it"
+            )
         if (self.filter == "observer") != (self.observer is not None):
             raise ParameterError(
                 f'[estimate.methods] {self.name!r}: filter = "observer" and a table observer = '
@@ -89,7 +100,8 @@ def build(
     """
     if method.filter == "observer":
         raise ParameterError(
-            f"method {method.name!r} observes a machine, but the case has a grid: use wls or kalman"
+            f"method {method.name!r} observes a machine, but the case has a grid: use wls, kalman, "
+            "ukf or ekf"
         )
     if method.filter == "wls":
         return tracking_wls(method.name, network, layout)
@@ -101,6 +113,13 @@ def build(
             process.learn_load(history, layout, network, study.step_s, source=method.source_sigma),
         )
     )
+    if method.filter in ("ukf", "ekf"):
+        polar = (
+            composition.scalar(network, layout, method.variance)
+            if method.noise == "scalar"
+            else of_grid(network, noise, state_columns(network, layout))
+        )
+        return composition.build(method.name, method.filter, method.compose, network, layout, polar)
     return kalman_filter(
         method.name,
         network,

@@ -1,0 +1,126 @@
+"""Unscented and extended filters from what a case file says: process × scaling × noise × gate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from pse_analysis.estimation import extended, gaussian, holt, noise, robust, unscented
+from pse_analysis.estimation.estimator import Estimator
+from pse_analysis.estimation.holt import HoltParams
+from pse_analysis.estimation.noise import VoltageNoise
+from pse_analysis.estimation.robust import Protection
+from pse_analysis.estimation.unscented import Scaling
+from pse_analysis.estimation.wls import state_columns
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import MeasurementModel, SensorLayout
+
+
+@dataclass(frozen=True)
+class Composition:
+    """What an unscented or extended filter is made of; any combination works.
+
+    Attributes
+    ----------
+    process : {"random_walk", "holt", "local_trend"}
+    scaling : {"fixed", "moments", "likelihood"}
+        How an unscented filter chooses α.
+    learning : {"none", "sage_husa"}
+        Whether it learns its process noise on the way.
+    robustness : {"none", "trace", "per_channel"}
+        How gross errors are met.
+    protected : bool
+        Whether a robust filter doubts its forecast after it has refused the same channels again
+        and again.
+    passes : int
+        Most linearisations of an extended filter per step; above 1 it is the iterated one.
+    holt, points, protection
+        Numbers of these parts.
+    forgetting : float
+        b of Sage and Husa.
+    """
+
+    process: Literal["random_walk", "holt", "local_trend"] = "random_walk"
+    scaling: Literal["fixed", "moments", "likelihood"] = "fixed"
+    learning: Literal["none", "sage_husa"] = "none"
+    robustness: Literal["none", "trace", "per_channel"] = "none"
+    protected: bool = True
+    passes: int = 1
+    forgetting: float = 0.97
+    holt: HoltParams = field(default_factory=HoltParams)
+    points: Scaling = field(default_factory=Scaling)
+    protection: Protection = field(default_factory=Protection)
+
+
+def compose(
+    kind: Literal["ukf", "ekf"],
+    composition: Composition,
+    network: Network,
+    layout: SensorLayout,
+    voltages: VoltageNoise,
+) -> gaussian.GaussianFilter:
+    """The filter of a composition.
+
+    Parameters
+    ----------
+    kind : {"ukf", "ekf"}
+    composition : Composition
+    network : Network
+    layout : SensorLayout
+    voltages : VoltageNoise
+        Process noise of the estimated voltages, from which learning starts.
+
+    Returns
+    -------
+    GaussianFilter
+    """
+    model = MeasurementModel(network, layout, state_columns(network, layout))
+    if composition.process == "random_walk":
+        process = holt.random_walk()
+    else:
+        smoothing = holt.holt if composition.process == "holt" else holt.local_trend
+        process = smoothing(composition.holt)
+    made = (
+        noise.known(voltages, process)
+        if composition.learning == "none"
+        else noise.sage_husa(voltages, process, composition.forgetting)
+    )
+    if kind == "ekf":
+        observation = extended.linearised(model, composition.passes)
+    else:
+        scaled = {
+            "fixed": unscented.fixed,
+            "moments": unscented.by_moments,
+            "likelihood": unscented.by_likelihood,
+        }[composition.scaling]
+        observation = scaled(model, composition.points)
+    judges = composition.robustness != "none" and composition.protected
+    return gaussian.GaussianFilter(
+        model,
+        process,
+        observation,
+        made,
+        gaussian.Robustness(
+            robust.JUDGES[composition.robustness], composition.protection if judges else None
+        ),
+    )
+
+
+def build(
+    name: str,
+    kind: Literal["ukf", "ekf"],
+    composition: Composition,
+    network: Network,
+    layout: SensorLayout,
+    voltages: VoltageNoise,
+) -> Estimator:
+    """Estimator of a composition, started from weighted least squares."""
+    made = compose(kind, composition, network, layout, voltages)
+    return gaussian.estimator(name, network, layout, made)
+
+
+def scalar(network: Network, layout: SensorLayout, variance: float) -> VoltageNoise:
+    """Q = q I on the voltages that a layout lets be estimated. [p.u.², rad²]"""
+    return noise.constant(np.full(len(state_columns(network, layout)), variance))

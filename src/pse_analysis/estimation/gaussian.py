@@ -1,0 +1,476 @@
+"""The recursion that the unscented and the extended filter share.
+
+Predict with an affine process, predict the measurements in whichever way (`Observe`), judge the
+innovation, condition. What is composed: process × observation × noise × robustness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import blas, lapack
+
+from pse_analysis.errors import Unobservable
+from pse_analysis.estimation import robust
+from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.holt import Process
+from pse_analysis.estimation.noise import Learnt, Noise
+from pse_analysis.estimation.robust import Judge, Protection, Suspicion
+from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import MeasurementModel, SensorLayout, wrap
+from pse_analysis.vocabulary import Status
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+
+class Moments(NamedTuple):
+    """Joint moments of a state and its measurements.
+
+    Attributes
+    ----------
+    mean : (m,) ndarray
+        ŷ.
+    own : (m, m) ndarray
+        Covariance of h(x), without the measurements' noise. Only the lower triangle counts.
+    cross : (N, m) ndarray
+        C, covariance of s and h(x).
+    tuned : float
+        What the observation remembers for the next step.
+    """
+
+    mean: FloatArray
+    own: FloatArray
+    cross: FloatArray
+    tuned: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before a snapshot.
+
+    Attributes
+    ----------
+    s, P : (N,), (N, N) ndarray
+    x : (2N_bus,) ndarray
+        [θ; |V|] of s, with the angles that are fixed.
+    columns : (n,) ndarray of int
+        Place of s's first n entries in x.
+    """
+
+    s: FloatArray
+    P: FloatArray
+    x: FloatArray
+    columns: IntArray
+
+    @property
+    def n(self) -> int:
+        """Number of estimated voltages; s holds their slopes behind them."""
+        return len(self.columns)
+
+    def filled(self, s: FloatArray) -> FloatArray:
+        """[θ; |V|] of another s."""
+        x = self.x.copy()
+        x[self.columns] = s[: self.n]
+        return x
+
+
+Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Moments]
+"""(prior, snapshot, rows, tuned, s) -> moments of the rows, linearised at s where it matters."""
+
+
+class Observation(NamedTuple):
+    """How the measurements are predicted.
+
+    Attributes
+    ----------
+    predict : Observe
+    tuned : float
+        Memory at the start.
+    passes : int
+        How often the prediction is renewed at the estimate that it led to; 1: never.
+    """
+
+    predict: Observe
+    tuned: float = 0.0
+    passes: int = 1
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """How gross errors are met.
+
+    Attributes
+    ----------
+    judge : Judge
+    protection : Protection, optional
+        Against latching; None to go without.
+    """
+
+    judge: Judge = robust.none
+    protection: Protection | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianState:
+    """State of a filter between two instants.
+
+    Attributes
+    ----------
+    s : (N,) ndarray
+        Estimated entries of [θ; |V|], and their slopes if the process has any. [rad, p.u.]
+    P : (N, N) ndarray
+        Its covariance.
+    x : (2N_bus,) ndarray
+        [θ; |V|].
+    process, noise : object
+        Memories of these parts.
+    tuned : float
+        Memory of the observation.
+    refusals : (m,) ndarray of int
+        Consecutive refusals of each channel.
+    """
+
+    s: FloatArray
+    P: FloatArray
+    x: FloatArray
+    process: Any
+    noise: Any
+    tuned: float
+    refusals: IntArray
+
+
+class _Update(NamedTuple):
+    s: FloatArray
+    P: FloatArray
+    innovation: FloatArray
+    variance: FloatArray
+    inflation: FloatArray
+    nis: float
+    tuned: float
+    iterations: int
+    converged: bool
+
+
+TOLERANCE = 1e-6
+"""Largest move of a voltage in the last pass of an iterated filter. [rad, p.u.]"""
+
+
+def cholesky(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of a covariance that rounding may have made a little indefinite.
+
+    Reads the lower triangle; above the diagonal the result is zero. If the factorisation fails,
+    the diagonal is raised by the smallest of 1e-14, 1e-12, … 1e-6 of itself that mends it.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If not even that helps.
+    """
+    factor, failed = lapack.dpotrf(matrix, lower=1, clean=1)
+    for power in (-14, -12, -10, -8, -6):
+        if not failed:
+            return np.asarray(factor)
+        raised = matrix + np.diag(10.0**power * np.diagonal(matrix))
+        factor, failed = lapack.dpotrf(raised, lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("covariance is not positive definite")
+    return np.asarray(factor)
+
+
+def condition(
+    prior: Prior, moments: Moments, innovation: FloatArray, noise: FloatArray, judge: Judge
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+    """Condition on an innovation, with the noise that a judge leaves.
+
+    Parameters
+    ----------
+    prior : Prior
+    moments : Moments
+    innovation : (m,) ndarray
+        η.
+    noise : (m,) ndarray
+        Diagonal of R.
+    judge : Judge
+
+    Returns
+    -------
+    s, P : (N,), (N, N) ndarray
+    variance : (m,) ndarray
+        S_ii before inflation.
+    inflation : (m,) ndarray
+        φ.
+    nis : float
+        ηᵀ(S + φR)⁻¹η.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If S is not positive definite.
+
+    Notes
+    -----
+    With S = L Lᵀ and X = C L⁻ᵀ: K η = X (L⁻¹η) and P - K S Kᵀ = P - X Xᵀ, a symmetric product.
+    """
+    m = len(innovation)
+    diagonal = np.diag_indices(m)
+    own = moments.own
+    variance = np.diagonal(own) + noise
+    S = own.copy(order="F")
+    S[diagonal] = variance
+    chol_S = _factor(S)
+    white, _ = lapack.dtrtrs(chol_S, innovation, lower=1)
+    nis = float(white @ white)
+    inflation = judge(Suspicion(innovation, variance, noise, chol_S, nis))
+    if inflation.any():
+        S[diagonal] = variance + inflation * noise
+        chol_S = _factor(S)
+        white, _ = lapack.dtrtrs(chol_S, innovation, lower=1)
+        nis = float(white @ white)
+    X = blas.dtrsm(1.0, chol_S, moments.cross, side=1, lower=1, trans_a=1)
+    return (
+        prior.s + X @ white,
+        _less(prior.P, X),
+        variance,
+        inflation,
+        nis,
+    )
+
+
+def _factor(S: FloatArray) -> FloatArray:
+    factor, failed = lapack.dpotrf(S, lower=1, clean=0)
+    if failed:
+        raise np.linalg.LinAlgError("the innovation's covariance is not positive definite")
+    return np.asarray(factor)
+
+
+def _less(P: FloatArray, X: FloatArray) -> FloatArray:
+    """P - X Xᵀ, exactly symmetric."""
+    lower = blas.dsyrk(-1.0, X, beta=1.0, c=P, lower=1)
+    return symmetric(lower)
+
+
+def symmetric(lower: FloatArray) -> FloatArray:
+    """The symmetric matrix of a lower triangle."""
+    out = np.tril(lower)
+    out += np.tril(lower, -1).T
+    return out
+
+
+class GaussianFilter:
+    """A filter for one sensor layout.
+
+    Parameters
+    ----------
+    model : MeasurementModel
+        Its columns are the voltages to be estimated.
+    process : Process
+    observation : Observation
+    noise : Noise
+    robustness : Robustness
+    """
+
+    def __init__(
+        self,
+        model: MeasurementModel,
+        process: Process,
+        observation: Observation,
+        noise: Noise,
+        robustness: Robustness | None = None,
+    ) -> None:
+        self.model = model
+        self.process = process
+        self.observation = observation
+        self.noise = noise
+        self.robustness = robustness or Robustness()
+
+    def begin(self, x: FloatArray, P: FloatArray, time: np.datetime64) -> GaussianState:
+        """State from an estimate of [θ; |V|] (2N,) with covariance P (n, n) of the columns."""
+        s, covariance, memory = self.process.begin(
+            x[self.model.columns], P, self.noise.voltages(x, time)
+        )
+        return GaussianState(
+            s,
+            covariance,
+            x,
+            memory,
+            self.noise.begin(x, time),
+            self.observation.tuned,
+            np.zeros(self.model.shape[0], dtype=np.int64),
+        )
+
+    def step(self, state: GaussianState, snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
+        """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
+        m = self.model.shape[0]
+        s, forecast, process = self.process.forecast(state.s, state.P, state.process)
+        columns = self.model.columns
+        ahead = state.x.copy()
+        ahead[columns] = s[: len(columns)]
+        drift, covariance, noise = self.noise.current(state.noise, ahead, snapshot.time)
+        affine = s
+        s = s + drift
+        x = state.x.copy()
+        x[columns] = s[: len(columns)]
+        prior = Prior(s, forecast + covariance, x, columns)
+        used = snapshot.available & snapshot.fresh
+        if not used.any():
+            return replace(state, s=s, P=prior.P, x=x, process=process), Info.nothing(
+                m, Status.PREDICTED
+            )
+        rows = np.flatnonzero(used)
+        try:
+            update = self._update(prior, snapshot, rows, state.tuned, self.robustness.judge)
+            refusals = np.zeros(m, dtype=np.int64)
+            refusals[rows] = np.where(update.inflation > 0, state.refusals[rows] + 1, 0)
+            status, detail = Status.OK, ""
+            protection = self.robustness.protection
+            if protection is not None and protection.latched(refusals, used):
+                update, refusals, status, detail = self._unlatch(
+                    prior, snapshot, rows, state.tuned, update, refusals, protection
+                )
+        except np.linalg.LinAlgError as error:
+            return None, Info.nothing(
+                m, Status.DIVERGED, f"{error}: the filter starts again from least squares"
+            )
+        if not update.converged:
+            status = Status.NOT_CONVERGED
+            detail = f"still moving after {update.iterations} passes; more noise would slow it less"
+        learnt = Learnt(update.s - affine, update.s - s, update.P, forecast)
+        after = GaussianState(
+            update.s,
+            update.P,
+            prior.filled(update.s),
+            process,
+            self.noise.learn(noise, learnt),
+            update.tuned,
+            refusals,
+        )
+        full = np.full((2, m), np.nan)
+        inflation = np.zeros(m)
+        full[0, rows], full[1, rows] = update.innovation, np.sqrt(update.variance)
+        inflation[rows] = update.inflation
+        return after, Info(
+            status,
+            update.iterations,
+            update.nis,
+            len(rows),
+            used,
+            full[0],
+            full[1],
+            inflation,
+            detail,
+        )
+
+    def _update(
+        self, prior: Prior, snapshot: Snapshot, rows: IntArray, tuned: float, judge: Judge
+    ) -> _Update:
+        R = snapshot.sigma[rows] ** 2
+        angular = self.model.angular[rows]
+        at = prior.s
+        converged = False
+        for passes in range(1, self.observation.passes + 1):  # noqa: B007 (reported below)
+            moments = self.observation.predict(prior, snapshot, rows, tuned, at)
+            eta = snapshot.z[rows] - moments.mean
+            eta[angular] = wrap(eta[angular])
+            s, P, variance, inflation, nis = condition(prior, moments, eta, R, judge)
+            moved = np.abs(s - at).max()
+            at, tuned = s, moments.tuned
+            if moved < TOLERANCE:
+                converged = True
+                break
+        return _Update(
+            s,
+            P,
+            eta,
+            variance,
+            inflation,
+            nis,
+            tuned,
+            passes,
+            converged or self.observation.passes == 1,
+        )
+
+    def _unlatch(
+        self,
+        prior: Prior,
+        snapshot: Snapshot,
+        rows: IntArray,
+        tuned: float,
+        update: _Update,
+        refusals: IntArray,
+        protection: Protection,
+    ) -> tuple[_Update, IntArray, Status, str]:
+        """Widen the forecast and judge by channel; kept if it clears half of the refused channels.
+
+        Wrong meters stay wrong whatever the forecast says.
+        """
+        patience = protection.patience
+        stuck = int(np.count_nonzero(refusals >= patience))
+        cause = f"{stuck} of {len(rows)} channels were refused {patience} times in a row"
+        P = prior.P.copy()
+        voltages = np.arange(prior.n)
+        P[voltages, voltages] += protection.widening(refusals)
+        widened = self._update(replace(prior, P=P), snapshot, rows, tuned, robust.per_channel)
+        if 2 * np.count_nonzero(widened.inflation) > np.count_nonzero(update.inflation):
+            return update, refusals, Status.OK, f"{cause}: a wider forecast does not clear them"
+        # A judge that refuses whole snapshots is not given another `patience` of them to lose.
+        again = np.zeros_like(refusals)
+        if self.robustness.judge is not robust.per_channel:
+            again[rows] = patience - 1
+        detail = f"{cause}: the forecast was widened, which cleared most of them"
+        return widened, again, Status.RESTARTED, detail
+
+
+def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianFilter) -> Estimator:
+    """Estimator that starts a filter from weighted least squares.
+
+    Parameters
+    ----------
+    name : str
+        Of the method.
+    network : Network
+    layout : SensorLayout
+    made : GaussianFilter
+
+    Returns
+    -------
+    Estimator
+        It uses every sample once, with the σ that its age gave it.
+    """
+    wls = WeightedLeastSquares(network, layout)
+    columns = made.model.columns
+    inside = np.ix_(columns, columns)
+
+    def init(snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
+        m = len(layout)
+        try:
+            solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available)
+        except Unobservable as error:
+            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
+        if not solution.converged:
+            return None, Info.nothing(m, Status.NOT_CONVERGED, "no start from least squares")
+        used = snapshot.available
+        info = Info(
+            Status.OK,
+            solution.iterations,
+            np.nan,
+            0,
+            used,
+            np.where(used, solution.residual, np.nan),
+            np.where(used, snapshot.sigma, np.nan),
+            np.zeros(m),
+        )
+        return made.begin(solution.x, solution.covariance()[inside], snapshot.time), info
+
+    def read(state: GaussianState) -> Voltages:
+        covariance = np.zeros((len(state.x), len(state.x)))
+        covariance[inside] = state.P[: len(columns), : len(columns)]
+        return Voltages(state.x, covariance)
+
+    return Estimator(name, init, made.step, read)

@@ -1,0 +1,346 @@
+"""Unscented prediction of the measurements, with a fixed or an adaptive spread of the points.
+
+The points stand at x and x ± √s L_i, where P = L Lᵀ and s = α²(n + κ). With γ₀ = h(x) and the odd
+and even parts d_i, e_i of h along L_i, h(x ± √s L_i) = γ₀ + e_i ± d_i, the weighted sums of the
+unscented transform become
+
+    ŷ = γ₀ + ē,  ē = Σ e_i/s
+    S = R + (D Dᵀ + E Eᵀ)/s + (β - α²) ē ēᵀ
+    C = L Dᵀ/√s
+
+which are the same numbers without the cancellation of large weights: S is positive definite as long
+as α² ≤ β, and P - C S⁻¹ Cᵀ = L (I - Dᵀ S⁻¹ D/s) Lᵀ always. Rows that are linear in x have no e.
+Slopes behind x do not enter h, so that the points need not spread along them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize
+from scipy.linalg import blas, lapack
+
+from pse_analysis.errors import ParameterError
+from pse_analysis.estimation.estimator import Snapshot
+from pse_analysis.estimation.gaussian import Moments, Observation, Prior, cholesky
+from pse_analysis.measurement import BUS, FROM, IA, TO, VA, VM, MeasurementModel, P, Q, wrap
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+ALPHA_RANGE = (0.02, 1.0)
+"""Where adaptive scaling looks for α."""
+ALPHA_TOLERANCE = 1e-3
+MAX_TRIALS = 8
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Parameters of the scaled unscented transform; the defaults are those of [qu2018].
+
+    Attributes
+    ----------
+    alpha, kappa
+        Spread: the points stand √(α²(n + κ)) standard deviations from the mean.
+    beta
+        Weight of the central point in the covariance; 2 is best for normal states. α = 1, κ = 0,
+        β = 0 is the cubature rule.
+    """
+
+    alpha: float = 1.0
+    kappa: float = 0.0
+    beta: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.alpha <= 1 and self.kappa >= 0 and self.beta >= 0):
+            raise ParameterError(
+                "scaling: expected 0 < alpha ≤ 1, kappa ≥ 0 and beta ≥ 0, received alpha = "
+                f"{self.alpha}, kappa = {self.kappa}, beta = {self.beta}"
+            )
+
+
+class Spread(NamedTuple):
+    """h around a mean.
+
+    Attributes
+    ----------
+    square : float
+        s.
+    centre : (m,) ndarray
+        γ₀.
+    odd : (m, n) ndarray
+        d_i in its columns.
+    curved : (k,) ndarray of int
+        Rows that are not linear in x.
+    even, shift : (k, n), (k,) ndarray
+        e_i in its columns, and ē, of the curved rows.
+    """
+
+    square: float
+    centre: FloatArray
+    odd: FloatArray
+    curved: IntArray
+    even: FloatArray
+    shift: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """ŷ. (m,)"""
+        out = self.centre.copy()
+        out[self.curved] += self.shift
+        return out
+
+
+class SigmaPoints:
+    """h at all sigma points of a state at once.
+
+    Parameters
+    ----------
+    model : MeasurementModel
+        Its columns are the voltages that are estimated.
+    """
+
+    def __init__(self, model: MeasurementModel) -> None:
+        self.model = model
+        quantity = model.layout.quantity
+        self._curved = ~np.isin(quantity, (VM, VA))
+        self._folded = quantity == IA
+
+    def spread(self, prior: Prior, chol_P: FloatArray, square: float, rows: IntArray) -> Spread:
+        """Odd and even parts of h along the columns of √s L, for some rows of the layout."""
+        n = prior.n
+        step = np.sqrt(square) * chol_P[:n, :n]
+        points = np.repeat(prior.x[:, None], 2 * n + 1, axis=1)
+        points[prior.columns, 1 : n + 1] += step
+        points[prior.columns, n + 1 :] -= step
+        y = self.model.h(points)
+        if len(rows) < len(y):
+            y = y[rows]
+        folded = self._folded[rows]
+        if folded.any():
+            centre = y[folded, :1]
+            y[folded] = centre + wrap(y[folded] - centre)
+        odd = y[:, 1 : n + 1] - y[:, n + 1 :]
+        odd *= 0.5
+        curved = np.flatnonzero(self._curved[rows])
+        # The even part of a linear row is nothing, and neither is it worth its square.
+        bent = y[_run(curved)]
+        even = bent[:, 1 : n + 1] + bent[:, n + 1 :]
+        even *= 0.5
+        even -= bent[:, :1]
+        return Spread(square, y[:, 0], odd, curved, even, even.sum(axis=1) / square)
+
+    def moments(
+        self,
+        prior: Prior,
+        chol_P: FloatArray,
+        spread: Spread,
+        rows: IntArray,
+        central: float,
+        tuned: float,
+    ) -> Moments:
+        """Moments of the rows; ``central`` is the weight β - α² of ē ēᵀ."""
+        n, square, run = prior.n, spread.square, _run(spread.curved)
+        # Fortran order is what BLAS reads without a copy; odd.T has it.
+        own = blas.dsyrk(1.0 / square, spread.odd.T, trans=1, lower=1)
+        bent = central * np.outer(spread.shift, spread.shift)
+        if len(bent):
+            bent = blas.dsyrk(
+                1.0 / square, spread.even.T, trans=1, lower=1, beta=1.0, c=np.asfortranarray(bent)
+            )
+            own[(run, run) if isinstance(run, slice) else np.ix_(run, run)] += bent
+        root = 1.0 / np.sqrt(square)
+        cross = blas.dtrmm(root, chol_P[:n, :n], spread.odd.T, lower=1)
+        if len(chol_P) > n:
+            cross = np.asfortranarray(np.vstack([cross, root * (chol_P[n:, :n] @ spread.odd.T)]))
+        return Moments(spread.mean, own, cross, tuned)
+
+
+def fixed(model: MeasurementModel, scaling: Scaling | None = None) -> Observation:
+    """Unscented prediction with a constant α.
+
+    Notes
+    -----
+    Eqs. (9)–(22) of [qu2018].
+    """
+    scaling = scaling or Scaling()
+    points = SigmaPoints(model)
+
+    def predict(
+        prior: Prior, _snapshot: Snapshot, rows: IntArray, _tuned: float, _at: FloatArray
+    ) -> Moments:
+        chol_P = cholesky(prior.P)
+        spread = points.spread(prior, chol_P, _square(scaling, scaling.alpha, prior.n), rows)
+        central = scaling.beta - scaling.alpha**2
+        return points.moments(prior, chol_P, spread, rows, central, scaling.alpha)
+
+    return Observation(predict, scaling.alpha)
+
+
+def by_moments(model: MeasurementModel, scaling: Scaling | None = None) -> Observation:
+    """Unscented prediction with the α whose mean is nearest to the true one.
+
+    Parameters
+    ----------
+    model : MeasurementModel
+    scaling : Scaling, optional
+        α to start from, κ and β.
+
+    Returns
+    -------
+    Observation
+
+    Notes
+    -----
+    α_k = argmin ‖ŷ(α) - E[h]‖² in the norm of R⁻¹, to 1e-3, over injected and branch powers, whose
+    mean is closed (`mean_power`); voltages have no error at any α, currents are left out. Read from
+    eqs. (23)–(26) of [qu2018], whose print is lost. The error of the mean is nearly linear in s
+    (its fourth-order term is), so secant steps find the least square in a few of them.
+    """
+    scaling = scaling or Scaling()
+    points = SigmaPoints(model)
+    power = PowerMean(model)
+
+    def predict(
+        prior: Prior, snapshot: Snapshot, rows: IntArray, tuned: float, _at: FloatArray
+    ) -> Moments:
+        chol_P = cholesky(prior.P)
+        target, which = power.mean(prior, rows)
+        sigma = snapshot.sigma[rows[which]]
+
+        def error(alpha: float) -> tuple[FloatArray, Spread]:
+            spread = points.spread(prior, chol_P, _square(scaling, alpha, prior.n), rows)
+            return (spread.mean[which] - target) / sigma, spread
+
+        alpha, spread = _least(error, tuned)
+        central = scaling.beta - alpha**2
+        return points.moments(prior, chol_P, spread, rows, central, alpha)
+
+    return Observation(predict, scaling.alpha)
+
+
+def by_likelihood(model: MeasurementModel, scaling: Scaling | None = None) -> Observation:
+    """Unscented prediction with the α under which the innovation is most likely.
+
+    It looks at the measurements that it then uses, so that P is a little too small.
+    """
+    scaling = scaling or Scaling()
+    points = SigmaPoints(model)
+
+    def predict(
+        prior: Prior, snapshot: Snapshot, rows: IntArray, _tuned: float, _at: FloatArray
+    ) -> Moments:
+        chol_P = cholesky(prior.P)
+        noise = np.diag(snapshot.sigma[rows] ** 2)
+
+        def moments(alpha: float) -> Moments:
+            spread = points.spread(prior, chol_P, _square(scaling, alpha, prior.n), rows)
+            return points.moments(
+                prior, chol_P, spread, rows, scaling.beta - alpha**2, float(alpha)
+            )
+
+        def cost(alpha: float) -> float:
+            found = moments(alpha)
+            factor, failed = lapack.dpotrf(found.own + noise, lower=1)
+            if failed:
+                return float(np.finfo(float).max)
+            eta = snapshot.z[rows] - found.mean
+            eta[model.angular[rows]] = wrap(eta[model.angular[rows]])
+            white, _ = lapack.dtrtrs(factor, eta, lower=1)
+            return float(white @ white + 2.0 * np.log(np.diagonal(factor)).sum())
+
+        best = optimize.minimize_scalar(
+            cost, bounds=ALPHA_RANGE, method="bounded", options={"xatol": ALPHA_TOLERANCE}
+        )
+        return moments(float(best.x))
+
+    return Observation(predict, scaling.alpha)
+
+
+def _run(rows: IntArray) -> slice | IntArray:
+    """Rows as a slice where they follow each other, which spares a copy."""
+    if len(rows) and rows[-1] - rows[0] + 1 == len(rows):
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows
+
+
+def _square(scaling: Scaling, alpha: float, n: int) -> float:
+    return alpha**2 * (n + scaling.kappa)
+
+
+def _least(
+    error: Callable[[float], tuple[FloatArray, Spread]], start: float
+) -> tuple[float, Spread]:
+    """α of least squared error, by Gauss-Newton secants in α²."""
+    low, high = ALPHA_RANGE
+    before = min(max(start, low), high)
+    value, spread = error(before)
+    alpha = before * 0.9 if before > 0.5 * high else before * 1.1
+    for _ in range(MAX_TRIALS):
+        new_value, spread = error(alpha)
+        slope = (new_value - value) / (alpha**2 - before**2)
+        steepness = float(slope @ slope)
+        if steepness == 0.0:
+            break
+        square = alpha**2 - float(slope @ new_value) / steepness
+        before, value = alpha, new_value
+        alpha = float(np.sqrt(np.clip(square, low**2, high**2)))
+        if abs(alpha - before) < ALPHA_TOLERANCE:
+            return before, spread
+    return before, spread
+
+
+class PowerMean:
+    """E[h] of the powers of a layout under a normal state, in closed form.
+
+    Parameters
+    ----------
+    model : MeasurementModel
+
+    Notes
+    -----
+    With δ = θ_i - θ_k, c_i = Cov(V_i, δ) and c_k = Cov(V_k, δ):
+    E[V_i V_k e^{jδ}] = e^{jE[δ] - Var(δ)/2} [(E V_i + j c_i)(E V_k + j c_k) + Cov(V_i, V_k)].
+    """
+
+    def __init__(self, model: MeasurementModel) -> None:
+        layout, network = model.layout, model.network
+        self._power = np.isin(layout.quantity, (P, Q))
+        self._active = layout.quantity == P
+        self._n_bus = network.n_bus
+        ends = np.stack([network.branches.from_bus, network.branches.to_bus])
+        entries: list[tuple[IntArray, ...]] = []
+        for side, y in ((BUS, network.y_bus), (FROM, network.y_from), (TO, network.y_to)):
+            row = np.flatnonzero(self._power & (layout.side == side))
+            at = layout.position[row]
+            chosen = y[at].tocoo()
+            metered = at if side == BUS else ends[side - FROM][at]
+            entries.append((row[chosen.row], metered[chosen.row], chosen.col, chosen.data))
+        # Every term of every row: V_i V_k y* of the metered bus i and the bus k at the other end.
+        self._row, self._i, self._k, admittance = (
+            np.concatenate(part) for part in zip(*entries, strict=True)
+        )
+        self._admittance: ComplexArray = admittance.conj()
+
+    def mean(self, prior: Prior, rows: IntArray) -> tuple[FloatArray, IntArray]:
+        """Means of the powers among the rows, and where among them they stand."""
+        n, i, k = self._n_bus, self._i, self._k
+        covariance = np.zeros((2 * n, 2 * n))
+        covariance[np.ix_(prior.columns, prior.columns)] = prior.P[: prior.n, : prior.n]
+        angle, both, size = covariance[:n, :n], covariance[n:, :n], covariance[n:, n:]
+        x = prior.x
+        variance = angle[i, i] - 2.0 * angle[i, k] + angle[k, k]
+        at_i, at_k = both[i, i] - both[i, k], both[k, i] - both[k, k]
+        product = np.exp(1j * (x[i] - x[k]) - 0.5 * variance) * (
+            (x[n + i] + 1j * at_i) * (x[n + k] + 1j * at_k) + size[i, k]
+        )
+        power = np.zeros(len(self._power), dtype=np.complex128)
+        np.add.at(power, self._row, self._admittance * product)
+        which = np.flatnonzero(self._power[rows])
+        chosen = rows[which]
+        return np.where(self._active[chosen], power.real[chosen], power.imag[chosen]), which
