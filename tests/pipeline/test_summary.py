@@ -35,6 +35,14 @@ def test_means_are_averaged_and_largest_errors_are_not(scored: pd.DataFrame) -> 
     assert line.split() == ["wls", "2.000", "20.00", "57.3", "–", "–", "95.0%", "–", "–", "–"]
 
 
+def test_text_is_the_same_where_a_notebook_runs_it(
+    scored: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = text("a case", scored)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    assert text("a case", scored) == plain
+
+
 def test_text_fits_any_terminal_of_100_columns(scored: pd.DataFrame) -> None:
     lines = text("a case", scored).splitlines()
     assert max(map(len, lines)) <= 100
@@ -54,3 +62,15 @@ def test_case_without_record_of_faults_says_so(scored: pd.DataFrame) -> None:
 def test_bars_of_magnitudes_do_not_break_the_markdown_table(scored: pd.DataFrame) -> None:
     rows = [line for line in markdown("a case", scored).splitlines() if line.startswith("|")]
     assert len({line.replace("\\|", "").count("|") for line in rows}) == 1
+
+
+def test_machine_is_reported_in_its_own_columns() -> None:
+    metrics = ("angle_rmse", "angle_rms", "angle_rms_theory", "speed_rms")
+    rows = [("matched", t, m, "", 0.03 + 0.01 * t, "rad") for m in metrics for t in (0, 1)]
+    columns = ["method", "trial", "metric", "element", "value", "unit"]
+    table = text("a machine", pd.DataFrame(rows, columns=columns))
+    line = next(line for line in table.splitlines() if "matched" in line)
+    # Thousandths; simulated RMS values are brought together by their squares.
+    assert line.split()[1:3] == ["35.4", "35.0"]
+    assert "θ RMS" in table
+    assert "|V|" not in table

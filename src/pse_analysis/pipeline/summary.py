@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import pandas as pd
 from rich import box
@@ -59,6 +59,17 @@ MACHINE_COLUMNS: Columns = (
     ("steps_not_ok", "steps\nnot ok", _sum, ".0f"),
 )
 
+CHECK_HEAD = (
+    "\nfaults by kind, then by channel",
+    "\ninjected",
+    "\nfound",
+    "\nrecall",
+    "false\nalarms",
+    "per 1000\ngood",
+    "\nprecision",
+)
+
+CHECKED = "What the checks found of the injected faults, all trials together"
 UNITS = "Errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
 MACHINE_UNITS = "RMS error of rotor angle θ and speed ω, and when it settles into ±2σ of theory"
 
@@ -79,16 +90,19 @@ def text(title: str, scored: pd.DataFrame) -> str:
         Table of that name; only rows of the whole case (element "") are shown, and trials are
         brought together: largest errors by their maximum, times by their sum, others by their mean.
     """
-    columns, units, _ = _form(scored)
+    units, head, rows = _content(scored)
     table = Table(title=f"{_title(title, scored)}\n{units}", title_style="", box=box.SIMPLE_HEAD)
-    table.add_column("\nmethod", no_wrap=True)
-    for _, heading, _, _ in columns:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in _rows(scored):
+    for heading in head:
+        justify: Literal["left", "right"] = "left" if heading is head[0] else "right"
+        table.add_column(heading, justify=justify, no_wrap=True)
+    for row in rows:
         table.add_row(*row)
     stored = io.StringIO()
     # A fixed width and no colours: the text is stored, and read again by runs of any terminal.
-    console = Console(file=stored, width=WIDTH, color_system=None, force_terminal=False)
+    # A notebook would take the text away from the file.
+    console = Console(
+        file=stored, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
+    )
     console.print(table)
     console.print(detection(scored), highlight=False)
     return "\n".join(line.rstrip() for line in stored.getvalue().strip("\n").splitlines()) + "\n"
@@ -96,10 +110,10 @@ def text(title: str, scored: pd.DataFrame) -> str:
 
 def markdown(title: str, scored: pd.DataFrame) -> str:
     """The same for the page of a recording."""
-    columns, units, _ = _form(scored)
-    head = ["method", *(" ".join(heading.split()) for _, heading, _, _ in columns)]
-    rule = ["---", *("---:" for _ in columns)]
-    lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in _rows(scored)]
+    units, headings, rows = _content(scored)
+    head = [" ".join(heading.split()) for heading in headings]
+    rule = ["---", *("---:" for _ in head[1:])]
+    lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
     return "\n".join(
         [f"# {_title(title, scored)}", "", f"{units}.", "", *table, *lines, "", detection(scored)]
@@ -126,8 +140,42 @@ def detection(scored: pd.DataFrame) -> str:
 
 
 def _title(title: str, scored: pd.DataFrame) -> str:
-    trials = scored.loc[scored["method"] != "validate", "trial"].nunique()
+    estimated = scored["method"] != "validate"
+    trials = scored.loc[estimated if estimated.any() else ~estimated, "trial"].nunique()
     return f"{title} ({trials} trial{'s' if trials != 1 else ''})"
+
+
+def _content(scored: pd.DataFrame) -> tuple[str, list[str], list[list[str]]]:
+    """What the table is about, its head and its rows: of methods, or of checks alone."""
+    if (scored["method"] == "validate").all() and len(scored):
+        return CHECKED, list(CHECK_HEAD), _check_rows(scored)
+    columns, units, _ = _form(scored)
+    return units, ["\nmethod", *(heading for _, heading, _, _ in columns)], _rows(scored)
+
+
+def _check_rows(scored: pd.DataFrame) -> list[list[str]]:
+    """A row per kind of fault, then one per channel, trials added up."""
+    counts = scored.pivot_table(
+        index="element", columns="metric", values="value", aggfunc="sum", sort=False
+    )
+    rates = scored[scored["metric"] == "false_alarm_rate"]
+    parts = [name for name in counts.index if name]
+    found = []
+    for name in sorted(parts, key=lambda part: ":" in part):
+        hits, missed, alarms = (counts[m].get(name) for m in ("found", "missed", "false_alarms"))
+        injected, flagged = hits + missed, hits + alarms
+        rate = rates.loc[rates["element"] == name, "value"].mean()
+        cells = [
+            name,
+            f"{injected:.0f}",
+            f"{hits:.0f}",
+            f"{hits / injected:.1%}" if injected else NOTHING,
+            f"{alarms:.0f}",
+            f"{1e3 * rate:.2f}" if math.isfinite(rate) else NOTHING,
+            f"{hits / flagged:.1%}" if flagged else NOTHING,
+        ]
+        found.append(cells)
+    return found
 
 
 def _form(scored: pd.DataFrame) -> tuple[Columns, str, dict[str, float]]:
