@@ -103,6 +103,7 @@ class FaultKind(enum.StrEnum):
     LOST = "lost"
     DUPLICATED = "duplicated"
     DELAYED = "delayed"
+    EMPTY = "empty"
 
 
 class Status(enum.StrEnum):

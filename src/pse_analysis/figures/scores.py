@@ -23,6 +23,7 @@ from pse_analysis.figures.paper import (
     thousandths,
     time_axis,
 )
+from pse_analysis.vocabulary import FaultKind
 
 BOUNDS = (0.005, 0.995)
 """Quantiles of chi-square between which NIS should lie 99 times in 100."""
@@ -228,7 +229,7 @@ def detection_table(scored: pd.DataFrame) -> pd.DataFrame:
     DataFrame
         Index: kinds of faults and ``all``; empty where the faults are not known.
     """
-    rows = scored[scored.method == "validate"]
+    rows = scored[(scored.method == "validate") & scored.element.isin(["", *FaultKind])]
     counts = ["found", "missed", "false_alarms"]
     table = rows[rows.metric.isin(counts)].pivot_table(
         index="element", columns="metric", values="value", aggfunc="sum", dropna=False

@@ -19,6 +19,8 @@ from pse_analysis.parameters import Study, build
 
 NAME = re.compile(r"[a-z0-9_-]+")
 TEXTS = ("title", "grid", "notebook")
+SERIES = ("generated", "curves")
+"""Tables of ``simulate`` that make a case of metered loads."""
 SECTIONS = ("machine", "study", "simulate", "validate", "align", "estimate", "score")
 
 
@@ -33,8 +35,9 @@ class Case:
     path : Path
         The TOML file.
     grid : str or None
-        Name in `pse_analysis.grid.library`; None if the raw folder brings its own grid, or if the
-        case is about a machine, whose nameplate is the table ``machine``.
+        Name in `pse_analysis.grid.library`; None if the raw folder brings its own grid, if the
+        case is about a machine, whose nameplate is the table ``machine``, or about metered loads
+        alone.
     notebook : str or None
         Notebook that tells the case's story, relative to the project.
     sections : mapping
@@ -52,6 +55,11 @@ class Case:
     def simulated(self) -> bool:
         """Whether the raw folder is made by the case itself."""
         return "simulate" in self.sections
+
+    @property
+    def of_series(self) -> bool:
+        """Whether the simulation is of metered loads alone, without a grid between them."""
+        return not set(self.sections.get("simulate", {})).isdisjoint(SERIES)
 
     @property
     def study(self) -> Study:
@@ -148,14 +156,18 @@ def _check(name: str, path: Path, data: dict[str, Any]) -> Case:
     for key in ("title", "study"):
         if key not in data:
             raise ParameterError(f"{path}: {key!r} is missing: add it to the case file")
-    if "grid" in data and "machine" in data:
+    models: list[str] = [name for name in ("grid", "machine") if name in data]
+    models += [f"simulate.{name}" for name in SERIES if name in data.get("simulate", {})][:1]
+    if len(models) > 1:
         raise ParameterError(
-            f"{path}: a case is about a grid or about a machine: remove grid or [machine]"
+            f"{path}: a case is about a grid or about a machine or about metered loads, received "
+            f"{' and '.join(models)}: keep one of them"
         )
-    if "simulate" in data and "grid" not in data and "machine" not in data:
+    if "simulate" in data and not models:
         raise ParameterError(
-            f'{path}: a case with [simulate] needs grid = "NAME", a name of the grid library, or a '
-            "table [machine] with a nameplate"
+            f'{path}: a case with [simulate] needs grid = "NAME", a name of the grid library, a '
+            "table [machine] with a nameplate, or loads in [[simulate.generated]] or "
+            "[[simulate.curves]]"
         )
     case = Case(
         name=name,

@@ -24,14 +24,16 @@ from pse_analysis.pipeline.case import Case
 from pse_analysis.pipeline.plan import SUMMARY, Job, Work
 from pse_analysis.pipeline.processes import each
 from pse_analysis.pipeline.summary import markdown, text
-from pse_analysis.pipeline.tables import merge_files, read_raw_table
+from pse_analysis.pipeline.tables import merge_files, read_raw_table, write_empty
 from pse_analysis.scoring import ScoreParams, observers, score
 from pse_analysis.simulation import (
     MachineSimulateParams,
+    SeriesSimulateParams,
     SimulateParams,
     profiles,
     simulate,
     simulate_machine,
+    simulate_series,
 )
 from pse_analysis.telemetry import read_model, read_raw, read_table, write_raw, write_table
 from pse_analysis.validation import ValidateParams, validate
@@ -46,7 +48,7 @@ class Parameters:
 
     study: Study
     machine: Machine | None
-    simulate: SimulateParams | MachineSimulateParams | None
+    simulate: SimulateParams | MachineSimulateParams | SeriesSimulateParams | None
     validate: ValidateParams
     align: AlignParams
     estimate: EstimateParams
@@ -67,7 +69,11 @@ def check_case(case: Case) -> Parameters:
         return build(cls, sections.get(name, {}), name)
 
     about_machine = "machine" in sections
-    simulation = MachineSimulateParams if about_machine else SimulateParams
+    simulation: type[Any] = SimulateParams
+    if about_machine:
+        simulation = MachineSimulateParams
+    elif case.of_series:
+        simulation = SeriesSimulateParams
     try:
         parameters = Parameters(
             study=case.study,
@@ -95,6 +101,12 @@ def _simulate(job: Job) -> None:
         assert params.machine is not None
         job.progress(0, 2, "moving the machine")
         raw = simulate_machine(params.machine, params.study, params.simulate)
+        job.progress(1, 2, "writing")
+        write_raw(job.output, raw)
+        return
+    if isinstance(params.simulate, SeriesSimulateParams):
+        job.progress(0, 2, "drawing loads and faults")
+        raw = simulate_series(profiles.load(job.profiles), params.study, params.simulate)
         job.progress(1, 2, "writing")
         write_raw(job.output, raw)
         return
@@ -191,6 +203,10 @@ def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
 
 def _estimate(job: Job) -> None:
     params = check_case(job.case)
+    if not params.estimate.methods:
+        for table in PARTS:
+            write_empty(job.output / f"{table}.parquet", table)
+        return
     aligned = job.inputs["align"] / "aligned.parquet"
     trials = sorted(set(pq.read_table(aligned, columns=["trial"])["trial"].unique().to_pylist()))
     tasks = [
@@ -260,6 +276,17 @@ def _score(job: Job) -> None:
     write_table(job.output / "scored.parquet", scored, "scored")
     (job.output / SUMMARY).write_text(text(job.case.title, scored), encoding="utf-8")
     job.progress(2, 3, "recording")
+    if not params.estimate.methods:
+        recording.detected(
+            job.output / "score.rrd",
+            job.case.name,
+            validated,
+            _channels(job.raw),
+            faults,
+            summary_markdown=markdown(job.case.title, scored),
+            study=params.study,
+        )
+        return
     if isinstance(model, Machine):
         recording.machine_scored(
             job.output / "score.rrd",

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.telemetry import read_model, read_table, read_telemetry
+from pse_analysis.telemetry.tables import arrow_type
+from pse_analysis.vocabulary import schema
 
 
 def read_network(raw: Path) -> Network:
@@ -52,10 +55,16 @@ def read_raw_table(raw: Path, table: str) -> pd.DataFrame | None:
     return read_table(path, table)
 
 
+def write_empty(path: Path, table: str) -> None:
+    """Write a table without rows."""
+    fields = [(name, arrow_type(c.dtype)) for name, c in schema(table).columns.items()]
+    pq.write_table(pa.schema(fields).empty_table(), path, compression="zstd")
+
+
 def merge_files(paths: Sequence[Path], target: Path) -> None:
     """Join parquet files of one schema, one after another, and remove them."""
-    schema = pq.read_schema(paths[0])
-    with pq.ParquetWriter(target, schema, compression="zstd") as writer:
+    form = pq.read_schema(paths[0])
+    with pq.ParquetWriter(target, form, compression="zstd") as writer:
         for path in paths:
             writer.write_table(pq.ParquetFile(path).read())
             path.unlink()

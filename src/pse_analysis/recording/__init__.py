@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pse_analysis.recording.detection import detected
 from pse_analysis.recording.estimates import estimated, scored
 from pse_analysis.recording.machine import machine_estimated, machine_scored
 from pse_analysis.recording.telemetry import aligned, validated
 
 __all__ = [
     "aligned",
+    "detected",
     "estimated",
     "machine_estimated",
     "machine_scored",

@@ -53,6 +53,8 @@ class ScoreParams:
         Whether consistency is also given by hour of day (UTC).
     by_element : bool
         Whether errors are also given by bus.
+    by_channel : bool
+        Whether detection of faults is also given by channel.
     settling : SettlingParams
         When an observer of a machine counts as settled.
     published : tuple of Published
@@ -61,6 +63,7 @@ class ScoreParams:
 
     by_hour: bool = True
     by_element: bool = True
+    by_channel: bool = False
     settling: observers.SettlingParams = field(default_factory=observers.SettlingParams)
     published: tuple[Published, ...] = ()
 
@@ -91,19 +94,25 @@ def score(
     -------
     DataFrame
         Table ``scored``. ``element`` is "" for the whole case, ``bus/…`` or ``hour/…`` for a part
-        of it, and the kind of fault for detection, whose method is "validate".
+        of it, and the kind of fault or the channel for detection, whose method is "validate".
     """
     params = params or ScoreParams()
-    parts = [consistency.of_steps(steps, by_hour=params.by_hour)]
-    if truth is not None:
+    parts = [consistency.of_steps(steps, by_hour=params.by_hour)] if len(steps) else []
+    if truth is not None and len(estimated):
         paired = errors.against_truth(estimated, truth)
         parts.append(errors.of_states(paired, by_element=params.by_element))
         parts.append(consistency.coverage(paired, by_hour=params.by_hour))
         if expected:
             parts.append(observers.of_observers(paired, expected, params.settling))
     if faults is not None:
-        parts.append(detection.of_faults(validated, faults))
-    scored = pd.concat([p for p in parts if len(p)], ignore_index=True)
+        parts.append(detection.of_faults(validated, faults, by_channel=params.by_channel))
+    parts = [p for p in parts if len(p)]
+    if not parts:
+        raise ParameterError(
+            "nothing to score: the case has no [[estimate.methods]] and no record of its faults; "
+            "add a method, or end the run with --until validate"
+        )
+    scored = pd.concat(parts, ignore_index=True)
     scored = _beside_print(scored, params.published)
     scored["trial"] = scored["trial"].astype("int32")
     return check("scored", scored)

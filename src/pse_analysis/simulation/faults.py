@@ -45,8 +45,8 @@ def inject(
     Samples
         ``kind`` and ``size`` say what was done. Size: spike: what was added, in the channel's unit;
         stale: age of the repeated value [s]; duplicated, delayed: how much later it arrives [s];
-        lost: 0. Lost samples are still among them, and the second copies of duplicated ones stand
-        at the end; the first copies carry no fault.
+        lost, empty: 0. Lost samples are still among them, and the second copies of duplicated ones
+        stand at the end; the first copies carry no fault.
     """
     for fault, child in zip(faults, seed.spawn(len(faults)), strict=True):
         rng = np.random.default_rng(child)
@@ -65,6 +65,9 @@ def inject(
             samples = dataclasses.replace(samples, value=samples.value + np.where(hit, shift, 0.0))
         elif fault.kind == FaultKind.LOST:
             samples = _mark(samples, hit, fault, np.zeros(n))
+        elif fault.kind == FaultKind.EMPTY:
+            samples = _mark(samples, hit, fault, np.zeros(n))
+            samples = dataclasses.replace(samples, value=np.where(hit, np.nan, samples.value))
         elif fault.kind == FaultKind.DELAYED:
             samples = _mark(samples, hit, fault, size)
             samples = dataclasses.replace(samples, arrival=samples.arrival + _us(hit * size))
