@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import composition, machine, process
+from pse_analysis.estimation import composition, machine, process, screening
 from pse_analysis.estimation.composition import Composition
 from pse_analysis.estimation.estimator import Estimated, Estimator, Record, States, record, run
 from pse_analysis.estimation.kalman import kalman_filter
@@ -19,6 +19,7 @@ from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.parameters import Study
+from pse_analysis.validation.adaptive import AdaptiveParams
 from pse_analysis.vocabulary import check
 
 __all__ = ["EstimateParams", "Estimated", "Estimator", "Method", "Record", "build", "estimate"]
@@ -46,6 +47,12 @@ class Method:
         What a ``ukf`` or ``ekf`` is made of.
     observer : ObserverParams, optional
         What an ``observer`` is designed from.
+    reading : {"interval", "instant"}
+        Whether a ``kalman`` filter reads a sample over the interval that it covers, once, or as a
+        value of the present instant, as often as it stands there.
+    screening : {"none", "literal", "absolute", "scaled", "innovation"}
+        How gross errors are met: by an adaptive threshold before any filter, or, in a ``kalman``
+        filter, by its own innovation.
     variant : str
         The aligned variant it reads.
     """
@@ -57,9 +64,18 @@ class Method:
     source_sigma: float | None = None
     compose: Composition = field(default_factory=Composition)
     observer: machine.ObserverParams | None = None
+    reading: Literal["interval", "instant"] = "interval"
+    screening: Literal["none", "literal", "absolute", "scaled", "innovation"] = "none"
     variant: str = "last"
 
     def __post_init__(self) -> None:
+        if self.filter != "kalman" and (
+            self.reading == "instant" or self.screening == "innovation"
+        ):
+            raise ParameterError(
+                f'[estimate.methods] {self.name!r}: reading = "instant" and screening = '
+                f'"innovation" are for filter = "kalman", not for {self.filter!r}: drop them'
+            )
         if self.filter not in ("ukf", "ekf") and self.compose != Composition():
             raise ParameterError(
                 f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, not for "
@@ -98,6 +114,17 @@ def build(
     ParameterError
         If the method is one of a machine.
     """
+    estimator = _build_plain(method, network, layout, study, history)
+    if method.screening == "none" or method.screening == "innovation":
+        return estimator
+    return screening.screened(
+        estimator, layout, AdaptiveParams(threshold=method.screening), history
+    )
+
+
+def _build_plain(
+    method: Method, network: Network, layout: SensorLayout, study: Study, history: Record
+) -> Estimator:
     if method.filter == "observer":
         raise ParameterError(
             f"method {method.name!r} observes a machine, but the case has a grid: use wls, kalman, "
@@ -127,6 +154,8 @@ def build(
         noise,
         step_s=study.step_s,
         reach_s=_reach(history, layout, study.step_s),
+        instant=method.reading == "instant",
+        refuse=screening.refuse() if method.screening == "innovation" else None,
     )
 
 

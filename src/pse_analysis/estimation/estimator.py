@@ -90,6 +90,11 @@ class Info:
         Factor φ added to the noise of a row by a robust filter; 0 where none was.
     detail : str
         What went wrong and what would help; "" if nothing did.
+    reasons : (m,) ndarray of int, optional
+        Bits of `Reason` for what a screening decided; without it an inflated row is
+        `Reason.INNOVATION`.
+
+    Rows with an innovation that were not used were refused.
     """
 
     status: Status
@@ -101,6 +106,18 @@ class Info:
     sigma_innovation: FloatArray
     inflation: FloatArray
     detail: str = ""
+    reasons: npt.NDArray[np.int32] | None = None
+
+    @property
+    def judged(self) -> BoolArray:
+        """Rows that were used or refused. (m,)"""
+        return np.asarray(self.used | np.isfinite(self.innovation))
+
+    @property
+    def findings(self) -> npt.NDArray[np.int32]:
+        """Bits of `Reason` of every row. (m,)"""
+        found = np.where(self.inflation > 0, int(Reason.INNOVATION), 0).astype(np.int32)
+        return found if self.reasons is None else self.reasons
 
     @classmethod
     def nothing(cls, m: int, status: Status, detail: str = "") -> Info:
@@ -396,7 +413,8 @@ def _tables(
             "nees": np.array(trace.nees),
             "dof": dof.astype(np.int32),
             "rejected": np.array(
-                [int(((i.inflation > 0) & i.used).sum()) for i in trace.info], dtype=np.int32
+                [int((i.judged & ((i.inflation > 0) | ~i.used)).sum()) for i in trace.info],
+                dtype=np.int32,
             ),
             "seconds": np.array(trace.seconds),
         }
@@ -413,10 +431,11 @@ def _tables(
             "sigma": (sigma * states.factor).ravel(),
         }
     )
-    at, row = np.nonzero(used)
-    innovation, deviation, inflation = (
+    judged = np.array([i.judged for i in trace.info]).reshape(count, len(layout))
+    at, row = np.nonzero(judged)
+    innovation, deviation, inflation, findings = (
         np.array([getattr(i, name) for i in trace.info]).reshape(count, len(layout))[at, row]
-        for name in ("innovation", "sigma_innovation", "inflation")
+        for name in ("innovation", "sigma_innovation", "inflation", "findings")
     )
     residuals = pd.DataFrame(
         {
@@ -427,8 +446,8 @@ def _tables(
             "innovation": innovation,
             "sigma_innovation": deviation,
             "inflation": inflation,
-            "used": True,
-            "reasons": np.where(inflation > 0, int(Reason.INNOVATION), 0).astype(np.int32),
+            "used": used[at, row],
+            "reasons": findings.astype(np.int32),
         }
     )
     return Estimated(estimated, residuals, steps)

@@ -8,7 +8,7 @@ covers them (`pse_analysis.estimation.intervals`). So a sample enters once, wher
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +18,16 @@ from pse_analysis.errors import Unobservable
 from pse_analysis.estimation import intervals
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
+from pse_analysis.estimation.screening import Refuse
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import RectangularModel, SensorLayout
-from pse_analysis.vocabulary import Status
+from pse_analysis.vocabulary import Reason, Status
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 
 REFINE_PU = 1e-3
 """The measurements are transformed again if an update moves a voltage by more than this. [p.u.]"""
@@ -109,6 +111,8 @@ def kalman_filter(
     *,
     step_s: float,
     reach_s: float = 0.0,
+    instant: bool = False,
+    refuse: Refuse | None = None,
 ) -> Estimator:
     """Kalman filter with F = I on the linear rectangular model.
 
@@ -125,11 +129,19 @@ def kalman_filter(
     reach_s : float
         How far samples reach back from the instant at which they are used, age and interval
         together; it sets how many past states are kept, and older samples are passed over. [s]
+    instant : bool
+        Whether every value counts as one of the present instant, with the σ that its age adds, and
+        held values count again. Cheap, and what [qi2025] does; but errors of values that are used
+        twice are correlated, so the filter is too sure of itself.
+    refuse : Refuse, optional
+        Asked about the innovation before every update; rows that it names are left out, and stand
+        in the info with their innovation.
 
     Returns
     -------
     Estimator
-        It starts from a weighted least-squares estimate and uses every sample once.
+        It starts from a weighted least-squares estimate and uses every sample once, unless
+        ``instant``.
 
     Notes
     -----
@@ -139,7 +151,7 @@ def kalman_filter(
     model = RectangularModel(network, layout)
     wls = WeightedLeastSquares(network, layout)
     n2 = 2 * network.n_bus
-    lags = int(np.ceil(reach_s / step_s - 1e-9))
+    lags = 0 if instant else int(np.ceil(reach_s / step_s - 1e-9))
     # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
     held = None if layout.has_angle else network.n_bus + network.slack
 
@@ -180,27 +192,60 @@ def kalman_filter(
         )
         return KalmanState(x, covariance), info
 
+    def linear(
+        snapshot: Snapshot,
+        sigma: FloatArray,
+        used: BoolArray,
+        rows: IntArray,
+        at: ComplexArray,
+        walk: FloatArray,
+    ) -> tuple[sparse.csr_array, FloatArray, FloatArray]:
+        """H over the kept instants, z and R of some rows, transformed at a voltage."""
+        H, z, spread = model.rows(snapshot.z, sigma, used, at)
+        H, z, spread = sparse.csr_array(H[rows]), z[rows], spread[rows]
+        if instant:
+            return H, z, np.diag(spread**2)
+        age, window = snapshot.age_s[rows], layout.window_s[rows]
+        R = intervals.bridge_covariance(age, window, step_s, lags) * (H @ walk @ H.T)
+        R[np.diag_indices_from(R)] += spread**2
+        return _lagged(H, intervals.weights(age, window, step_s, lags)), z, R
+
     def step(state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
         m = len(layout)
         before = _voltage(state.x, network.n_bus)
         walk = process(before, snapshot.time)
         prior = predict(state, walk)
-        age, window = snapshot.age_s, layout.window_s
-        used = snapshot.available & snapshot.fresh & intervals.covered(age, window, step_s, lags)
+        if instant:
+            used, sigma = snapshot.available, snapshot.sigma
+        else:
+            near = intervals.covered(snapshot.age_s, layout.window_s, step_s, lags)
+            used = snapshot.available & snapshot.fresh & near
+            sigma = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
         if not used.any():
             return prior, Info.nothing(m, Status.PREDICTED)
+        refused = np.zeros(m, dtype=bool)
+        full = np.full((2, m), np.nan)
+        if refuse is not None:
+            rows = np.flatnonzero(used)
+            lagged, z, R = linear(snapshot, sigma, used, rows, before, walk)
+            full[0, rows] = z - lagged @ prior.x
+            S = _symmetric(lagged @ (lagged @ prior.P).T) + R
+            full[1, rows] = np.sqrt(np.diagonal(S))
+            refused[rows] = refuse(full[0, rows], S)
+            used = used & ~refused
+            if not used.any():
+                return prior, replace(
+                    Info.nothing(m, Status.PREDICTED),
+                    innovation=full[0],
+                    sigma_innovation=full[1],
+                    reasons=_refusals(refused),
+                )
         rows = np.flatnonzero(used)
-        share = intervals.weights(age[rows], window[rows], step_s, lags)
-        bridge = intervals.bridge_covariance(age[rows], window[rows], step_s, lags)
-        sigma = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
         at = before
         for passes in range(1, MAX_PASSES + 1):  # noqa: B007 (reported after the loop)
-            H, z, spread = model.rows(snapshot.z, sigma, used, at)
-            H, z, spread = sparse.csr_array(H[rows]), z[rows], spread[rows]
-            R = bridge * (H @ walk @ H.T)
-            R[np.diag_indices_from(R)] += spread**2
+            lagged, z, R = linear(snapshot, sigma, used, rows, at, walk)
             try:
-                posterior, innovation, deviation, nis = update(prior, _lagged(H, share), z, R)
+                posterior, innovation, deviation, nis = update(prior, lagged, z, R)
             except np.linalg.LinAlgError:
                 return None, Info.nothing(
                     m,
@@ -212,10 +257,17 @@ def kalman_filter(
             if np.abs(after - at).max() < REFINE_PU:
                 break
             at = after
-        full = np.full((2, m), np.nan)
         full[0, rows], full[1, rows] = innovation, deviation
         return posterior, Info(
-            Status.OK, passes, nis, len(rows), used, full[0], full[1], np.zeros(m)
+            Status.OK,
+            passes,
+            nis,
+            len(rows),
+            used,
+            full[0],
+            full[1],
+            np.zeros(m),
+            reasons=_refusals(refused),
         )
 
     def read(state: KalmanState) -> Voltages:
@@ -237,6 +289,14 @@ def _lagged(H: sparse.csr_array, share: FloatArray) -> sparse.csr_array:
     count = np.bincount(row, weights=kept.sum(axis=1), minlength=m)
     indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     return sparse.csr_array((data[kept], column[kept], indptr), shape=(m, n * share.shape[1]))
+
+
+def _refusals(refused: BoolArray) -> npt.NDArray[np.int32]:
+    return np.where(refused, int(Reason.INNOVATION), 0).astype(np.int32)
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (matrix + matrix.T))
 
 
 def _voltage(x: FloatArray, n_bus: int) -> ComplexArray:
