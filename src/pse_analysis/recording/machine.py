@@ -57,30 +57,28 @@ def machine_estimated(
     measured = measured[(measured.origin == "measured") & (measured.quantity == STATES[0])]
     methods = method_colours(dict.fromkeys(own.method))
     window = open_on(own.time_utc, study)
+    first = min(3, len(methods) - 1)
     rows = []
     for quantity, title in _NAMES.items():
         part = own[own.quantity == quantity]
         shown = part.true if truth is not None else part.value
+        symbol = " ".join(title.split()[-2:])
         tabs = [window.plot(f"{quantity}/{m}", f"{m}: {title}", shown) for m in methods]
-        rows.append(rrb.Tabs(*tabs, name=title))
+        rows.append(rrb.Tabs(*tabs, active_tab=first))
         if truth is not None:
-            late = part.error[part.time_utc > window.start + 0.3 * (window.end - window.start)]
-            end = 1.2 * float(late.abs().quantile(0.999)) if len(late) else 1.0
-            rows.append(
-                rrb.Tabs(
-                    *(
-                        window.plot(f"error/{quantity}/{m}", f"{m}: error of {title}", [-end, end])
-                        for m in methods
-                    ),
-                    name=f"error of {title}",
-                )
-            )
+            late = part[part.time_utc > window.start + 0.3 * (window.end - window.start)]
+            ends = 1.2 * late.error.abs().groupby(late.method).max()
+            errors = [
+                window.plot(f"error/{quantity}/{m}", f"{m}: error of {symbol}", [-ends[m], ends[m]])
+                for m in methods
+            ]
+            rows.append(rrb.Tabs(*errors, active_tab=first))
     blueprint = marks.panels(
         rrb.Horizontal(
             rrb.Vertical(
                 *rows,
                 window.lanes("status", "how each step ended"),
-                row_shares=[3.0] * len(rows) + [2.0],
+                row_shares=[3.0] * len(rows) + [4.0],
             ),
             rrb.TextDocumentView(origin="text/estimated", name="what is to be seen"),
             column_shares=[5, 2],
