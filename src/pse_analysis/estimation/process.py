@@ -36,6 +36,10 @@ ProcessNoise = Callable[[ComplexArray, np.datetime64], FloatArray]
 """Covariance of x = [e; f] added by the step to an instant, (2N, 2N), at a forecast voltage."""
 
 DAY_S = 86400.0
+FEWEST_CHANGES = 24
+"""Changes below which no correlation is learnt."""
+SHRINKAGE = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
+"""Shares of the mean correlation that are tried."""
 USUAL_SOURCE = 1e-3
 """σ of the source voltage's change per step where history tells nothing. [p.u.]"""
 
@@ -209,10 +213,9 @@ def learn_load(
     that, and the more the faster the load reverts; but if its changes d between the ends of the
     intervals have autocovariances c₀, c₁, 0, …, and it moves as a Brownian bridge in between, then
     E(m₊ - 2m + m₋)² = c₀ whatever c₁ is. So means enter by their second difference, instantaneous
-    samples by the first; 6σ² or 2σ² of the meter itself are taken off. The correlation is
-    shrunk towards the identity by the intensity that Schäfer and Strimmer (2005) derive from its
-    sampling variance. The variances are then scaled so that every day's changes have a mean NIS of
-    1 under what the other days teach.
+    samples by the first; 6σ² or 2σ² of the meter itself are taken off first. The correlation is
+    shrunk towards its mean over all pairs as far as held-out days ask for, and the variances are
+    enlarged where the changes of a day have a mean NIS above 1 under what the other days teach.
     """
     n = network.n_bus
     slots = round(DAY_S / slot_s)
@@ -221,7 +224,9 @@ def learn_load(
     correlation = np.eye(2 * n)
     if len(meters.place):
         square, within = _fit(meters, slots, slot_s, bandwidth_s)
-        square = square * _held_out_ratio(meters, slots, slot_s, bandwidth_s)
+        shrinkage, ratio = _held_out(meters, slots, slot_s, bandwidth_s)
+        square = square * ratio
+        within = _shrunk(within, shrinkage)
         moving = np.maximum(square - meters.noise, 0.1 * square)
         deviation[:, meters.place] = np.sqrt(moving / meters.span_s * step_s)
         correlation[np.ix_(meters.place, meters.place)] = within
@@ -319,52 +324,66 @@ def _fit(
     trust = effective / (effective + 5.0)
     whole = squared.sum(axis=0) / known.sum(axis=0)
     square = np.maximum(trust * (weight @ squared) / mass + (1 - trust) * whole, 1e-16)
-    return square, _shrunk_correlation(
-        meters.change / np.sqrt(square[_slot(meters, slots, slot_s)])
-    )
+    return square, _correlation(_standardised(meters, square, slot_s))
 
 
-def _slot(meters: _Meters, slots: int, slot_s: float) -> npt.NDArray[np.int64]:
-    return np.asarray((meters.second // slot_s).astype(np.int64) % slots)
+def _standardised(meters: _Meters, square: FloatArray, slot_s: float) -> FloatArray:
+    """Changes over their root mean square at that time of day, 0 where there is none. (T, k)"""
+    slot = (meters.second // slot_s).astype(np.int64) % len(square)
+    return np.nan_to_num(meters.change / np.sqrt(square[slot]))
 
 
-def _held_out_ratio(meters: _Meters, slots: int, slot_s: float, bandwidth_s: float) -> float:
-    """Mean NIS per meter of each day's changes under what the other days teach.
-
-    Variances and correlations learnt from a few days are too sure of themselves; this is by how
-    much. 1 where there are fewer than three days to hold out.
-    """
-    days = np.unique(meters.day)
-    if len(days) < 3:
-        return 1.0
-    total = count = 0.0
-    for day in days:
-        apart = meters.only(meters.day == day)
-        square, correlation = _fit(meters.only(meters.day != day), slots, slot_s, bandwidth_s)
-        white = apart.change / np.sqrt(square[_slot(apart, slots, slot_s)])
-        white = white[np.isfinite(white).all(axis=1)]
-        total += float(np.sum(white.T * np.linalg.solve(correlation, white.T)))
-        count += white.size
-    return total / count if count else 1.0
-
-
-def _shrunk_correlation(panel: FloatArray) -> FloatArray:
-    """Correlation of the columns of (n_time, k) values, shrunk to be positive definite."""
-    full = panel[np.isfinite(panel).all(axis=1)]
-    k = panel.shape[1]
-    if len(full) < 8:
-        return np.eye(k)
+def _correlation(panel: FloatArray) -> FloatArray:
+    """Correlation of (T, k) values from the instants at which each pair has both, semi-definite."""
+    together = np.maximum((panel != 0).astype(float).T @ (panel != 0), 1.0)
+    product = panel.T @ panel / together
     # A meter that stands still has no correlation with any other.
-    centred = (full - full.mean(axis=0)) / np.maximum(full.std(axis=0), 1e-12)
-    count = len(centred)
-    sample = centred.T @ centred / count
-    fourth = (centred**2).T @ centred**2 / count
-    spread = (fourth - sample**2) / (count - 1)
-    off = ~np.eye(k, dtype=bool)
-    strength = float(np.clip(spread[off].sum() / max((sample[off] ** 2).sum(), 1e-300), 0.05, 1.0))
-    shrunk = (1.0 - strength) * sample
-    np.fill_diagonal(shrunk, 1.0)
-    return np.asarray(shrunk)
+    scale = np.sqrt(np.maximum(np.diagonal(product), 1e-12))
+    product = product / np.outer(scale, scale)
+    np.fill_diagonal(product, 1.0)
+    value, vector = np.linalg.eigh(product)
+    positive = (vector * np.maximum(value, 0.0)) @ vector.T
+    scale = np.sqrt(np.diagonal(positive))
+    return np.asarray(positive / np.outer(scale, scale))
+
+
+def _shrunk(correlation: FloatArray, share: float) -> FloatArray:
+    """Correlation drawn by a share towards one that is the same between all pairs, their mean."""
+    k = len(correlation)
+    mean = max((correlation.sum() - k) / max(k * (k - 1), 1), 0.0)
+    # The last 2 % keep it positive definite even where all pairs move as one.
+    alike = 0.98 * mean + (1.0 - 0.98 * mean) * np.eye(k)
+    return np.asarray((1.0 - share) * correlation + share * alike)
+
+
+def _held_out(
+    meters: _Meters, slots: int, slot_s: float, bandwidth_s: float
+) -> tuple[float, float]:
+    """How far to shrink the correlation, and by what to scale the variances.
+
+    Parts of the record (days, or four parts of a shorter one) are held out in turn. The shrinkage
+    is the one under which they are likeliest; the scale is their mean NIS per meter under what the
+    other parts teach, if that is more than 1. It is taken as 1 where there are not three days,
+    because the hours of a day differ.
+    """
+    days = len(np.unique(meters.day))
+    rows = np.arange(len(meters.day))
+    if len(rows) < FEWEST_CHANGES:
+        return 1.0, 1.0
+    nis, log_determinant = np.zeros(len(SHRINKAGE)), np.zeros(len(SHRINKAGE))
+    count = 0
+    for held in np.array_split(rows, max(days, 4)):
+        apart, rest = meters.only(np.isin(rows, held)), meters.only(~np.isin(rows, held))
+        square, correlation = _fit(rest, slots, slot_s, bandwidth_s)
+        white = _standardised(apart, square, slot_s)
+        for i, share in enumerate(SHRINKAGE):
+            chol_C = np.linalg.cholesky(_shrunk(correlation, share))
+            nis[i] += np.sum(linalg.solve_triangular(chol_C, white.T, lower=True) ** 2)
+            log_determinant[i] += 2.0 * len(held) * np.sum(np.log(np.diagonal(chol_C)))
+        count += int(np.isfinite(apart.change).sum())
+    best = int(np.argmin(nis + log_determinant))
+    ratio = max(float(nis[best]) / count, 1.0) if days >= 3 else 1.0
+    return float(SHRINKAGE[best]), ratio
 
 
 def _fill_unmetered(deviation: FloatArray, network: Network) -> None:
