@@ -22,7 +22,6 @@ Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 CHECKS = ("limits", "increment", "extrapolation", "combination")
-_WARM_UP = 200
 
 
 class Faulty(NamedTuple):
@@ -84,8 +83,10 @@ def generated_load(
         Value before the first sample. [unit]
     n_channel : int
     """
-    drawn = rng.standard_normal((n + _WARM_UP, n_channel))
-    change = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], drawn, axis=0)[_WARM_UP:]
+    drawn = rng.standard_normal((n, n_channel))
+    # The first increment is drawn from the stationary law, so no run-up has to be thrown away.
+    drawn[1:] *= np.sqrt(1.0 - rho**2)
+    change = lfilter([1.0], [1.0, -rho], drawn, axis=0)
     return np.asarray(level + sigma * np.cumsum(change, axis=0))
 
 
