@@ -415,7 +415,7 @@ class GaussianFilter:
         cause = f"{stuck} of {len(rows)} channels were refused {patience} times in a row"
         P = prior.P.copy()
         voltages = np.arange(prior.n)
-        P[voltages, voltages] += protection.widening(refusals)
+        P[voltages, voltages] += protection.widening(refusals[rows])
         widened = self._update(replace(prior, P=P), snapshot, rows, tuned, robust.per_channel)
         if 2 * np.count_nonzero(widened.inflation) > np.count_nonzero(update.inflation):
             return update, refusals, Status.OK, f"{cause}: a wider forecast does not clear them"

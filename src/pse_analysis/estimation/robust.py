@@ -176,8 +176,7 @@ class Protection:
     share : float
         Share of the channels that must be stuck.
     sigma : float
-        Standard deviation by which the forecast is then widened, times the number of times that
-        it has been in vain. [p.u., rad]
+        Standard deviation by which the forecast is then widened. [p.u., rad]
     """
 
     patience: int = 3
@@ -204,5 +203,9 @@ class Protection:
         return stuck >= max(2.0, self.share * np.count_nonzero(used))
 
     def widening(self, refusals: IntArray) -> float:
-        """Variance to add to every voltage. [p.u.², rad²]"""
-        return float((self.sigma * (int(refusals.max()) // self.patience)) ** 2)
+        """Variance to add to every voltage; it grows while most channels stay refused.
+
+        Meters that are wrong for good refuse to agree as well, but they are few.
+        """
+        in_vain = float(np.median(refusals)) // self.patience
+        return float((self.sigma * max(1.0, in_vain)) ** 2)
