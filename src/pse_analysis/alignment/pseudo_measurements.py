@@ -139,14 +139,16 @@ def forecast(
     if history < FEWEST:
         method = "hold"
     value = kernel[method](filled, history, horizon, day)
+    # On its first day a profile has nothing to go by, nor does a smoothing at its start.
+    begin = min(day, history // 2)
     sigma = np.empty((horizon + 1, filled.shape[1]))
     sigma[0] = noise
     for ahead in range(1, horizon + 1):
         count = history - ahead
-        if count < FEWEST:
+        if count - begin < FEWEST:
             sigma[ahead] = sigma[ahead - 1] * np.sqrt(2.0)
             continue
-        error = readings[ahead:history] - value[:count, ahead]
+        error = readings[begin + ahead : history] - value[begin:count, ahead]
         known = np.isfinite(error)
         square = np.where(known, error, 0.0) ** 2
         sigma[ahead] = np.sqrt(square.sum(axis=0) / np.maximum(known.sum(axis=0), 1))

@@ -40,7 +40,7 @@ _AHEAD = np.array([-0.5, 0.0, 0.5, 1.0])
 """Weights of the last four values in the value that their line predicts next."""
 SPREAD_OF_LINE = float(np.sqrt(1.0 + _AHEAD @ _AHEAD))
 """√(1 + x'(X'X)⁻¹x) of that prediction, 1.58."""
-MEMORY = 24
+MEMORY = 60
 """Residuals that the median is taken of."""
 FEWEST = 6
 """Residuals below which there is no median, and the meter's own σ is all there is."""
@@ -171,7 +171,7 @@ def step(
     with np.errstate(invalid="ignore"):
         around = np.where(np.isfinite(turn), np.rint((z - last) / turn), 0.0)
     z_near = z - np.nan_to_num(around) * np.where(np.isfinite(turn), turn, 0.0)
-    forecast = _AHEAD @ state.values[-LINE:]
+    forecast = _weighted(_AHEAD, state.values[-LINE:])
     residual = np.abs(z_near - forecast)
     noise = SPREAD_OF_LINE * sigma
     known = np.isfinite(state.residuals).sum(axis=0)
@@ -185,7 +185,7 @@ def step(
 
     weight = params.decay ** np.arange(params.window - 1)[::-1]
     past = state.values[-(params.window - 1) :]
-    replacement = (weight @ past) / weight.sum()
+    replacement = _weighted(weight, past) / weight.sum()
 
     suspects = _pushed(state.suspects, z_near, suspicious)
     run = np.where(present, np.where(suspicious, state.run + 1, 0), state.run)
@@ -264,6 +264,11 @@ def _printed(
         return difference[-1], sigma**2 * level / variance
 
 
+def _weighted(weight: FloatArray, rows: FloatArray) -> FloatArray:
+    """Weighted sum of rows, added in one order however many columns there are."""
+    return np.asarray((weight[:, None] * rows).sum(axis=0))
+
+
 def _pushed(past: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
     """The past with a new row at its end, in some columns."""
     out = past.copy()
@@ -286,6 +291,6 @@ def _agree(suspects: FloatArray, bound: FloatArray) -> BoolArray:
     n = len(suspects)
     time = np.arange(n) - 0.5 * (n - 1)
     centred = suspects - suspects.mean(axis=0)
-    slope = (time @ centred) / (time @ time)
+    slope = _weighted(time, centred) / (time @ time)
     with np.errstate(invalid="ignore"):
         return np.asarray((np.abs(centred - np.outer(time, slope)) <= bound).all(axis=0))
