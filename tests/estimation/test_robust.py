@@ -206,7 +206,7 @@ def test_protected_filter_does_not_diverge_where_q_is_wrong(robustness: str, q: 
 
 
 def jump(b: Bench, made: object, at: int = 8) -> Replay:
-    """All angles jump by 0.1 rad or less at one instant and stay there, under next to no process noise."""
+    """All angles jump by up to 0.1 rad at one instant and stay, under next to no process noise."""
     truth = np.repeat(b.truth[:1], 21, axis=0)
     truth[at:, : b.network.n_bus] += 0.1 * np.linspace(0.5, 1.0, b.network.n_bus)
     exact = made.model.h(truth.T).T  # type: ignore[attr-defined]

@@ -229,6 +229,7 @@ def condition(
     nis = float(white @ white)
     inflation = judge(Suspicion(innovation, variance, noise, chol_S, nis))
     if inflation.any():
+        S = own.copy(order="F")
         S[diagonal] = variance + inflation * noise
         chol_S = _factor(S)
         white, _ = lapack.dtrtrs(chol_S, innovation, lower=1)
@@ -244,7 +245,8 @@ def condition(
 
 
 def _factor(S: FloatArray) -> FloatArray:
-    factor, failed = lapack.dpotrf(S, lower=1, clean=0)
+    """Lower Cholesky factor, in the place of S."""
+    factor, failed = lapack.dpotrf(S, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the innovation's covariance is not positive definite")
     return np.asarray(factor)
@@ -252,7 +254,8 @@ def _factor(S: FloatArray) -> FloatArray:
 
 def _less(P: FloatArray, X: FloatArray) -> FloatArray:
     """P - X Xᵀ, exactly symmetric."""
-    lower = blas.dsyrk(-1.0, X, beta=1.0, c=P, lower=1)
+    # P is symmetric, so that its transpose is itself in the order that BLAS reads.
+    lower = blas.dsyrk(-1.0, X, beta=1.0, c=P.T, lower=1)
     return symmetric(lower)
 
 

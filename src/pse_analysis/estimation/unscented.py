@@ -114,10 +114,11 @@ class SigmaPoints:
     def spread(self, prior: Prior, chol_P: FloatArray, square: float, rows: IntArray) -> Spread:
         """Odd and even parts of h along the columns of √s L, for some rows of the layout."""
         n = prior.n
-        step = np.sqrt(square) * chol_P[:n, :n]
+        step = np.sqrt(square) * np.ascontiguousarray(chol_P[:n, :n])
         points = np.repeat(prior.x[:, None], 2 * n + 1, axis=1)
-        points[prior.columns, 1 : n + 1] += step
-        points[prior.columns, n + 1 :] -= step
+        columns = _run(prior.columns)
+        points[columns, 1 : n + 1] += step
+        points[columns, n + 1 :] -= step
         y = self.model.h(points)
         if len(rows) < len(y):
             y = y[rows]
