@@ -121,7 +121,7 @@ def variance_against_k(
         "", (k_opt, least), (k_opt, naive), arrowprops={"arrowstyle": "<->", "color": TRUTH}
     )
     gain = 100.0 * (naive - least) / naive
-    ax.text(k_opt + 0.04, 0.5 * (naive + least), f"ΔPC = {gain:.1f} %", va="center")
+    ax.text(k_opt, 0.72 * least, f"ΔPC = {gain:.1f} %", va="top", ha="center")
     ax.plot([0.0], [naive], "s", ms=5, color=TRUTH, label="k = 0, no change")
     ax.plot([k_opt], [least], "D", ms=5, color=TRUTH, label=f"k_opt = {k_opt:.2f}")
     ax.set_ylim(0.0, float(form.max()) * 1.04)
@@ -158,7 +158,6 @@ def extrapolated(
     ax.plot(t, plain, "s--", ms=3, mfc="none", color=ORANGE, label="2 no change, k = 0")
     ax.plot(t, sharp, "^-", ms=3, mfc="none", color=BLUE, label="3 extrapolated, k = k_opt")
     ax.set_ylabel(f"Load [{unit}]")
-    ax.set_xlabel("Time [UTC]")
     below.axhline(0.0, color=TRUTH, lw=0.6)
     below.plot(t, x - plain, "s--", ms=3, mfc="none", color=ORANGE)
     below.plot(t, x - sharp, "^-", ms=3, mfc="none", color=BLUE)
@@ -198,10 +197,9 @@ def share_against_threshold(
     ):
         ax.semilogy(g, _percent(share), color=colour, label=name)
     if faulty is not None:
-        for share, colour, label in zip(
-            faulty, (ORANGE, BLUE), (None, "with gross errors"), strict=True
-        ):
-            ax.semilogy(g, _percent(share), color=colour, ls="--", label=label)
+        for share, colour in zip(faulty, (ORANGE, BLUE), strict=True):
+            ax.semilogy(g, _percent(share), color=colour, ls="--")
+        ax.plot([], [], "--", color=TRUTH, label="with gross errors")
     ax.set_ylim(0.01, 100)
     ax.set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
     ax.set_xlabel("Threshold γ/σ [1]")
@@ -287,22 +285,33 @@ def risk_curves(
 
 
 @styled
-def roc_curves(table: pd.DataFrame, *, width: float = SINGLE) -> Paper:
+def roc_curves(
+    table: pd.DataFrame, predicted: pd.DataFrame | None = None, *, width: float = SINGLE
+) -> Paper:
     """Detection against false alarms, a curve per check.
 
     Parameters
     ----------
     table : DataFrame
-        Columns ``check``, ``false_alarm`` and ``detection``.
+        Columns ``check``, ``false_alarm`` and ``detection``, as samples come.
+    predicted : DataFrame, optional
+        The same given good references; drawn dashed.
     """
-    figure = paper(width, 2.8)
+    figure = paper(width, 2.9)
     ax = figure.subplots()
     markers = {"limits": "x", "increment": "s", "extrapolation": "^", "combination": "o"}
     for check, part in table.groupby("check", sort=False):
         name = str(check)
-        shown = part[part.false_alarm > 0].sort_values("false_alarm")
+        shown = part[part.false_alarm > 0].sort_values("quantile")
         ax.semilogx(100 * shown.false_alarm, 100 * shown.detection, marker=markers[name], ms=3,
                     mfc="none", color=CHECKS[name], label=NAMES[name])  # fmt: skip
+    if predicted is not None:
+        for check, part in predicted.groupby("check", sort=False):
+            ax.semilogx(100 * part.false_alarm, 100 * part.detection, "--", lw=0.9,
+                        color=CHECKS[str(check)])  # fmt: skip
+        ax.plot([], [], "--", lw=0.9, color=TRUTH, label="given good references")
+    ax.set_xlim(0.02, 100)
+    ax.set_xticks([0.1, 1, 10, 100], ["0.1", "1", "10", "100"])
     ax.set_ylim(0, 100)
     ax.set_xlabel("Good samples flagged [%]")
     ax.set_ylabel("Gross errors found [%]")
@@ -350,10 +359,10 @@ def realised_rates(table: pd.DataFrame, *, width: float = DOUBLE) -> Paper:
             colour, name = CHECKS[str(check)], NAMES[str(check)]
             ax.plot(part.q, 100 * part.predicted, color=colour, label=f"{name}, predicted")
             ax.errorbar(part.q, 100 * part.conditional, yerr=300 * part.conditional_error, fmt="o",
-                        ms=4, mfc="white", color=colour, capsize=2,
-                        label="good references")  # fmt: skip
-            ax.plot(part.q, 100 * part.unconditional, "x", ms=5, mew=1.3, color=colour,
-                    label="as they come")  # fmt: skip
+                        ms=4, mfc="white", color=colour, capsize=2)  # fmt: skip
+            ax.plot(part.q, 100 * part.unconditional, "x", ms=5, mew=1.3, color=colour)
+        ax.plot([], [], "o", ms=4, mfc="white", color=TRUTH, label="good references, ±3 s.e.")
+        ax.plot([], [], "x", ms=5, mew=1.3, color=TRUTH, label="as samples come")
         ax.set_xscale("log")
         ticks = sorted(table.q.unique())
         ax.set_xticks(ticks, [f"{q:g}" for q in ticks])
@@ -376,7 +385,7 @@ def margins(table: pd.DataFrame, *, width: float = DOUBLE) -> Paper:
     Parameters
     ----------
     table : DataFrame
-        Index: curves; columns ``rho``, ``claimed``, ``margin`` and ``error``.
+        Index: curves; columns ``rho``, ``claimed``, ``margin``, ``error`` and ``as_they_come``.
     """
     rows = table.sort_values("rho", key=np.abs)
     at = np.arange(len(rows))
@@ -391,6 +400,8 @@ def margins(table: pd.DataFrame, *, width: float = DOUBLE) -> Paper:
         left.plot(some.rho, at[chosen], "o", ms=3.5, mfc=fill, color=colour)
         right.errorbar(100 * some.margin, at[chosen], xerr=200 * some.error, fmt="o", ms=3.5,
                        mfc=fill, color=colour, capsize=1.5, lw=0.9, label=label)  # fmt: skip
+    right.plot(100 * rows.as_they_come, at, "|", ms=6, mew=1.4, color=VERMILION,
+               label="as samples come")  # fmt: skip
     for ax in (left, right):
         ax.axvline(0.0, color=TRUTH, lw=0.7)
     left.set_yticks(at, [str(name).removesuffix("_pload") for name in rows.index])
@@ -398,7 +409,7 @@ def margins(table: pd.DataFrame, *, width: float = DOUBLE) -> Paper:
     left.set_xlim(-1, 1)
     left.set_ylabel("Load curve [name]")
     left.set_xlabel("ρ̂₁ of the history [1]")
-    right.set_xlabel("Errors found by extrapolation less by first increments [% of errors]")
+    right.set_xlabel("Errors found, extrapolation less first increments [% of errors]")
     right.tick_params(labelleft=False)
     legend(figure, right)
     return figure
@@ -412,5 +423,5 @@ def _percent(share: npt.ArrayLike) -> Array:
 
 def _key(ax: Axes) -> None:
     """A key above its own axes, where two panels show different things."""
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2,
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2,
               columnspacing=1.0, handlelength=1.5)  # fmt: skip

@@ -22,13 +22,13 @@ MOVING = ("increment", "extrapolation")
 FACTORS = (0.5, 0.75, 1.25, 1.5)
 """Of the Bayes threshold, whose risk is compared with its own."""
 
-_BISECTIONS = 14
+_BISECTIONS = 11
 
 
 def known_structure(n_channel: int, rho: float = 0.5, sigma: float = 1.0) -> Structure:
     """Structure of loads whose increments are AR(1), as if learnt without error."""
     variance = np.tile(
-        gap_variance(sigma**2, rho ** np.arange(1, N_LAG + 1), N_LAG), (n_channel, 1)
+        gap_variance(sigma, rho ** np.arange(1, N_LAG + 1), N_LAG), (n_channel, 1)
     )
     return Structure(variance, np.full(n_channel, 10_000), np.zeros(n_channel))
 
@@ -151,15 +151,45 @@ def risk_around_optimum(
     return pd.DataFrame(rows, columns=["check", "factor", "risk", "excess", "error"])
 
 
+def predicted_roc(
+    quantiles: npt.ArrayLike,
+    *,
+    amplitude: float = thresholds.DEFAULT_AMPLITUDE,
+    rho: float = 0.5,
+) -> pd.DataFrame:
+    """Detection against false alarms by the closed forms, which hold given good references.
+
+    Returns
+    -------
+    DataFrame
+        Columns ``check``, ``quantile``, ``false_alarm``, ``detection``, as of `trials.roc`.
+    """
+    k = np.asarray(quantiles, dtype=float)
+    parts = [
+        pd.DataFrame(
+            {
+                "check": check,
+                "quantile": k,
+                "false_alarm": thresholds.false_alarm(k),
+                "detection": 1.0 - thresholds.miss(k, amplitude / _spread(check, rho)),
+            }
+        )
+        for check in MOVING
+    ]
+    return pd.concat(parts, ignore_index=True)
+
+
 def margins(
     curves: pd.DataFrame,
     rng: np.random.Generator,
     *,
     n_history: int,
     amplitude: float = thresholds.DEFAULT_AMPLITUDE,
-    share: float = 0.02,
     false_alarm: float = 0.02,
-    repeats: int = 100,
+    share: float = 0.01,
+    repeats: int = 60,
+    n_block: int = 24,
+    n_bootstrap: int = 200,
 ) -> pd.DataFrame:
     """What extrapolation finds more than first increments do, at equal false alarms, per curve.
 
@@ -172,52 +202,73 @@ def margins(
         First samples, from which σ and k = ρ̂₁ are learnt; errors are put into the rest.
     amplitude : float
         A, largest gross error over σ of the increment.
-    share : float
-        Of samples with an error.
     false_alarm : float
-        Rate at which both checks are held; the first-increment check gets the larger of two that
-        enclose it.
-    repeats : int
-        Draws of the errors.
+        Share of good samples beyond γ, for both checks.
+    share, repeats : float, int
+        Share of samples with an error, and draws of the errors, for the margin as samples come.
+    n_block, n_bootstrap : int
+        Samples drawn together, and draws, of the bootstrap that gives the standard error.
 
     Returns
     -------
     DataFrame
         Index: curves. ``rho`` (ρ̂₁), ``evidence`` (standard errors by which the history shows a
-        gain), ``claimed`` (whether the validate stage would extrapolate), ``increment`` and
-        ``extrapolation`` (shares of errors found), ``margin`` and its standard error ``error``
-        (over the samples of the curve, repeats brought together).
+        gain), ``claimed`` (whether the validate stage would extrapolate). Given good references:
+        ``increment`` and ``extrapolation`` (probability that an error is found), ``margin`` and its
+        standard error ``error``. ``as_they_come`` is the margin where references may be bad.
+
+    Notes
+    -----
+    Given good references nothing has to be drawn: an error n ~ U(−a, a) on an extrapolation error e
+    is found with probability 1 − |[−γ−e, γ−e] ∩ [−a, a]|/2a, and γ is a quantile of |e|.
     """
     history = curves.iloc[:n_history].to_numpy(dtype=float)
     learnt = learn(history, np.arange(n_history, dtype=float)[:, None])
     claimed = extrapolation.gains(learnt)
     rows = []
     for i, name in enumerate(curves.columns):
-        own = Structure(
+        x = curves[name].to_numpy(dtype=float)[n_history - 2 :]
+        rho, largest = learnt.autocorrelation[i, 0], amplitude * learnt.sigma[i]
+        both = np.stack([extrapolation.errors(x, k)[2:] for k in (0.0, rho)])
+        plain, sharp = _found(both, largest, false_alarm)
+        drawn = [
+            _found(_blocks(both, rng, n_block), largest, false_alarm) for _ in range(n_bootstrap)
+        ]
+        error = np.std([b - a for a, b in drawn], ddof=1)
+        alone = Structure(
             np.tile(learnt.variance[i], (repeats, 1)),
             np.full(repeats, learnt.count[i]),
             np.zeros(repeats),
         )
-        x = np.tile(curves[name].to_numpy(dtype=float)[n_history:, None], (1, repeats))
-        faulty = trials.with_errors(x, rng, share=share, largest=amplitude * learnt.sigma[i])
-        sharp = _at_rate(faulty, own, "extrapolation", false_alarm)
-        plain = _at_rate(faulty, own, "increment", float(sharp[~faulty.bad].mean()))
-        gain = np.where(faulty.bad, sharp.astype(float) - plain, np.nan)
-        by_sample = np.nanmean(gain[faulty.bad.any(axis=1)], axis=1)
-        rows.append(
-            (
-                name,
-                learnt.autocorrelation[i, 0],
-                learnt.evidence[i],
-                claimed[i],
-                plain[faulty.bad].mean(),
-                sharp[faulty.bad].mean(),
-                by_sample.mean(),
-                by_sample.std(ddof=1) / np.sqrt(len(by_sample)),
-            )
-        )
-    columns = ["rho", "evidence", "claimed", "increment", "extrapolation", "margin", "error"]
-    return pd.DataFrame(rows, columns=["curve", *columns]).set_index("curve")
+        tiled = np.tile(x[2:, None], (1, repeats))
+        faulty = trials.with_errors(tiled, rng, share=share, largest=largest)
+        as_it_comes = _margin_as_they_come(faulty, alone, false_alarm)
+        row = (name, rho, learnt.evidence[i], claimed[i])
+        rows.append((*row, plain, sharp, sharp - plain, error, as_it_comes))
+    columns = ["curve", "rho", "evidence", "claimed", "increment", "extrapolation", "margin"]
+    table = pd.DataFrame(rows, columns=[*columns, "error", "as_they_come"])
+    return table.set_index("curve")
+
+
+def _found(errors: Array, largest: float, false_alarm: float) -> Array:
+    """Mean probability that an error is found, a row per check, γ at equal false alarms."""
+    gamma = np.quantile(np.abs(errors), 1.0 - false_alarm, axis=1, keepdims=True)
+    low, high = np.maximum(-gamma - errors, -largest), np.minimum(gamma - errors, largest)
+    return np.asarray((1.0 - np.maximum(high - low, 0.0) / (2.0 * largest)).mean(axis=1))
+
+
+def _blocks(errors: Array, rng: np.random.Generator, n_block: int) -> Array:
+    """As many samples again, drawn in blocks, so that the course of a day stays together."""
+    n = errors.shape[1]
+    begin = rng.integers(0, n - n_block + 1, -(-n // n_block))
+    at = (begin[:, None] + np.arange(n_block)).ravel()[:n]
+    return np.asarray(errors[:, at])
+
+
+def _margin_as_they_come(faulty: trials.Faulty, structure: Structure, false_alarm: float) -> float:
+    sharp = _at_rate(faulty, structure, "extrapolation", false_alarm)
+    plain = _at_rate(faulty, structure, "increment", float(sharp[~faulty.bad].mean()))
+    return float(sharp[faulty.bad].mean() - plain[faulty.bad].mean())
 
 
 def _spread(check: str, rho: float) -> float:
