@@ -8,6 +8,7 @@ global state.
 from __future__ import annotations
 
 from pse_analysis.figures import machine
+from pse_analysis.figures.filters import curves
 from pse_analysis.figures.one_line import grid
 from pse_analysis.figures.paper import DOUBLE, SINGLE, Paper
 from pse_analysis.figures.scores import (
@@ -25,6 +26,7 @@ __all__ = [
     "Paper",
     "consistency",
     "coverage_by_hour",
+    "curves",
     "detection_table",
     "errors_by_bus",
     "flags",
