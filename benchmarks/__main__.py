@@ -23,7 +23,7 @@ from benchmarks.timing import Row  # noqa: E402
 
 README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- numbers -->", "<!-- end of numbers -->"
-PARTS = ("grid", "wls", "kalman", "unscented", "validation")
+PARTS = ("grid", "wls", "kalman", "unscented", "validation", "alignment")
 PACKAGES = ("numpy", "scipy", "pandapower", "filterpy")
 
 

@@ -16,6 +16,7 @@ cross-correlation, stands instead.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -67,7 +68,7 @@ class TimeParams:
     """
 
     sources: tuple[str, ...] = ("scada",)
-    window_s: float = 3600.0
+    window_s: float = 2700.0
     largest_delay_s: float = 120.0
     lag_window_s: float = 86400.0
     least_confidence: float = 0.05
@@ -193,10 +194,8 @@ def match_window(
     grid = seen + radius * step
     owner = np.searchsorted(0.5 * (arrival[1:] + arrival[:-1]), grid)
     device, other = _z_score(value[owner]), _z_score(reference.value[first : last + 1])
-    path = np.array(
-        dtw.warping_path_fast(device, other, window=radius + 1, inner_dist="euclidean"),
-        dtype=np.int64,
-    )
+    pairs = dtw.warping_path_fast(device, other, window=radius + 1, inner_dist="euclidean")
+    path = np.fromiter(chain.from_iterable(pairs), np.int64, 2 * len(pairs)).reshape(-1, 2)
     time = seen[path[:, 1]]
     whose = owner[path[:, 0]]
     delay = arrival[whose] - time

@@ -137,9 +137,9 @@ def align(
         raise TableError(
             f"validated: channel {name!r} is not in the channels table: add it there, or drop it"
         )
-    instants = _instants(study)
+    instants = instants_of(study)
     source = channels["source"].to_numpy(dtype=object)
-    start = _start(study)
+    start = start_of(study)
     stamps: dict[str, SamplingTimes | None] = {"none": None}
     tables = []
     for variant in params.variants or (Variant(params.variant),):
@@ -226,7 +226,7 @@ def _forecasts(
     them for news each time: their variance is multiplied by the instants that a reading serves.
     """
     value, sigma = np.zeros(len(row)), np.ones(len(row))
-    start = _start(study)
+    start = start_of(study)
     group = samples.group[row]
     period = {g: _period(samples.time[samples.group == g]) for g in np.unique(group)}
     for length in sorted(set(period.values())):
@@ -279,7 +279,8 @@ class _Samples:
     reasons: npt.NDArray[np.int32]
 
 
-def _instants(study: Study) -> IntArray:
+def instants_of(study: Study) -> IntArray:
+    """Instants of history and study. [µs since 1970 UTC]"""
     start, end, history = (
         pd.Timestamp(t).tz_convert("UTC").value // 1000
         for t in (study.start, study.end, study.history_start)
@@ -289,7 +290,7 @@ def _instants(study: Study) -> IntArray:
     return np.arange(start - before * step, end, step, dtype=np.int64)
 
 
-def _start(study: Study) -> int:
+def start_of(study: Study) -> int:
     """First instant of the study. [µs since 1970 UTC]"""
     return int(pd.Timestamp(study.start).tz_convert("UTC").value // 1000)
 
@@ -365,7 +366,7 @@ def _movement(samples: _Samples, layout: SensorLayout, study: Study) -> FloatArr
     Without enough history a channel is taken to move by its own σ per step.
     """
     n_group = int(samples.group.max(initial=-1)) + 1
-    start = _start(study)
+    start = start_of(study)
     same = samples.group[1:] == samples.group[:-1]
     past = same & (samples.arrival[1:] < start)
     group, place = samples.group[1:][past], samples.column[1:][past]

@@ -167,10 +167,7 @@ def step(
     state : AdaptiveState
     decision : Decision
     """
-    last = state.values[-1]
-    with np.errstate(invalid="ignore"):
-        around = np.where(np.isfinite(turn), np.rint((z - last) / turn), 0.0)
-    z_near = z - np.nan_to_num(around) * np.where(np.isfinite(turn), turn, 0.0)
+    z_near = _near(z, state.values[-1], turn)
     forecast = _weighted(_AHEAD, state.values[-LINE:])
     residual = np.abs(z_near - forecast)
     noise = SPREAD_OF_LINE * sigma
@@ -187,9 +184,13 @@ def step(
     past = state.values[-(params.window - 1) :]
     replacement = _weighted(weight, past) / weight.sum()
 
-    suspects = _pushed(state.suspects, z_near, suspicious)
+    suspects = state.suspects
+    if suspicious.any():
+        suspects = _pushed(suspects, z_near, suspicious)
     run = np.where(present, np.where(suspicious, state.run + 1, 0), state.run)
-    released = suspicious & (run > params.release) & _agree(suspects, scaled)
+    released = suspicious & (run > params.release)
+    if released.any():
+        released &= _agree(suspects, scaled)
     flagged = suspicious & ~released
 
     values = _pushed(state.values, np.where(flagged, replacement, z_near), present)
@@ -250,6 +251,17 @@ def screen(
     return Decision(*(np.array(part) for part in zip(*decisions, strict=True)))
 
 
+def _near(z: FloatArray, last: FloatArray, turn: FloatArray | float) -> FloatArray:
+    """Samples, with angles turned by whole turns to the last value of their channel."""
+    angle = np.isfinite(turn) & np.isfinite(last)
+    if not angle.any():
+        return z
+    full = np.broadcast_to(turn, z.shape)[angle]
+    near = z.copy()
+    near[angle] -= np.rint((z[angle] - last[angle]) / full) * full
+    return near
+
+
 def _printed(
     values: FloatArray, z: FloatArray, sigma: FloatArray, params: AdaptiveParams
 ) -> tuple[FloatArray, FloatArray]:
@@ -264,13 +276,15 @@ def _printed(
         return difference[-1], sigma**2 * level / variance
 
 
-def _weighted(weight: FloatArray, rows: FloatArray) -> FloatArray:
+def _weighted(weight: npt.NDArray[np.floating], rows: FloatArray) -> FloatArray:
     """Weighted sum of rows, added in one order however many columns there are."""
     return np.asarray((weight[:, None] * rows).sum(axis=0))
 
 
 def _pushed(past: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
     """The past with a new row at its end, in some columns."""
+    if where.all():
+        return np.concatenate([past[1:], new[None]])
     out = past.copy()
     out[:-1, where] = past[1:, where]
     out[-1, where] = new[where]
