@@ -187,8 +187,9 @@ def screened(
             np.maximum(info.inflation, params.sigma_factor**2 - 1.0),
             info.inflation,
         )
-        found = reasons if info.reasons is None else reasons | info.reasons
-        return state._replace(inner=inner), replace(info, inflation=inflation, reasons=found)
+        return state._replace(inner=inner), replace(
+            info, inflation=inflation, reasons=reasons | info.findings
+        )
 
     def init(snapshot: Snapshot) -> tuple[ScreenedState, Info]:
         return step(primed(), snapshot)
