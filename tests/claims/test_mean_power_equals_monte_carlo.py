@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pse_analysis.estimation.gaussian import Prior
+from pse_analysis.estimation.conditioning import Prior
 from pse_analysis.estimation.unscented import PowerMean
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve

@@ -6,8 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.estimation.conditioning import Moments, Prior
 from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.gaussian import Moments, Observation, Prior
+from pse_analysis.estimation.gaussian import Observation
 from pse_analysis.measurement import MeasurementModel, wrap
 
 FloatArray = npt.NDArray[np.float64]

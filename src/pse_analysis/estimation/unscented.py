@@ -25,8 +25,9 @@ from scipy import optimize
 from scipy.linalg import blas, lapack
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.estimation.conditioning import Moments, Prior, cholesky
 from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.gaussian import Moments, Observation, Prior, cholesky
+from pse_analysis.estimation.gaussian import Observation
 from pse_analysis.measurement import BUS, FROM, IA, TO, VA, VM, MeasurementModel, P, Q, wrap
 
 FloatArray = npt.NDArray[np.float64]

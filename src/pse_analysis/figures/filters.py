@@ -9,13 +9,13 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from pse_analysis.drawing import BLUE, GREEN, ORANGE, SKY, VERMILION
+from pse_analysis.drawing import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
 from pse_analysis.errors import TableError
 from pse_analysis.figures.paper import DOUBLE, MEASURED, TRUTH, Paper, legend, paper, styled
 
 Floats = npt.NDArray[np.float64]
 
-_COLOURS = (BLUE, SKY, ORANGE, GREEN, VERMILION)
+_COLOURS = (BLUE, SKY, ORANGE, GREEN, VERMILION, PURPLE)
 _OWN = {"true": TRUTH, "measured": MEASURED}
 
 
