@@ -42,7 +42,7 @@ notebook-tests: $(VENV)/.dev cases-all
 	$(if $(NOTEBOOKS),$(BIN)/python -m pytest --nbmake --nbmake-timeout=600 -W default $(NOTEBOOKS),@true)
 
 tests: $(VENV)/.dev
-	$(BIN)/python -m pytest tests
+	$(BIN)/python -m pytest -n 2 tests
 
 clean:
 	rm -rf $(VENV) data/processed/*/ .pytest_cache .mypy_cache .ruff_cache
