@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 
@@ -37,6 +40,17 @@ def results(options: Options) -> pipeline.Results:
 def test_second_run_finds_everything_current(results: pipeline.Results, options: Options) -> None:
     assert set(results.recordings) == {"validate", "align", "score"}
     assert runner.run(CASE.stem, options).ran == ()
+
+
+def test_reader_that_has_seen_enough_is_no_bug(results: pipeline.Results, options: Options) -> None:
+    arguments = ["run", CASE.stem, "--data", str(options.data), "--cases", str(options.cases)]
+    code = f"import sys; from pse_analysis.pipeline.cli import main; sys.exit(main({arguments}))"
+    run = subprocess.Popen([sys.executable, "-c", code], stdout=PIPE, stderr=PIPE, text=True)
+    assert run.stdout is not None
+    run.stdout.close()
+    run.stdout = None
+    _, said = run.communicate(timeout=60)
+    assert (run.returncode, said) == (1, "")
 
 
 def test_nothing_is_estimated_and_everything_is_checked(results: pipeline.Results) -> None:

@@ -229,6 +229,8 @@ def _run(options: argparse.Namespace) -> int:
     for name in names:
         try:
             runner.run(name, wanted, Bars() if sys.stdout.isatty() else Lines())
+        except BrokenPipeError:
+            raise
         except Exception as error:
             _explain(error, options.debug)
             failed.append(name)

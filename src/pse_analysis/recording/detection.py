@@ -62,19 +62,21 @@ def detected(
     )
     names = [str(name) for name in channels.channel][:MAX_SERIES]
     own = of_trial(validated, trial).sort_values("time_utc", kind="stable")
+    units = channels.set_index("channel").unit
     plots = []
     for name in names:
         part = own[own.channel == name]
         limit = part.threshold.where(part.time_utc >= window.start)
         top = [0.0, 3.0 * float(limit.median())] if limit.notna().any() else [0.0, 1.0]
-        title = f"{name.replace(':', ' ')}: |change| against its threshold"
+        title = f"{name.replace(':', ' ')}: surprise and threshold [{units[name]}]"
         plots.append(window.plot(marks.entity_path("decided", name), title, top, zero=True))
     views: list[rrb.View] = []
     sizes = {name: _by_size(known[known.channel == name]) for name in names}
     sizes = {name: table for name, table in sizes.items() if len(table)}
-    for name in sizes:
+    for name, table in sizes.items():
         legend = rrb.PlotLegend(visible=True)
-        title = f"{name.replace(':', ' ')}: spikes by size"
+        end = f"{table.index[-1]:.3g} {units[name]}"
+        title = f"{name.replace(':', ' ')}: spikes by size, in {N_BIN} groups from 0 to {end}"
         views.append(
             rrb.BarChartView(
                 origin=marks.entity_path("sizes", name), name=title, plot_legend=legend
@@ -95,7 +97,7 @@ def detected(
         for name, table in sizes.items():
             entity = marks.entity_path("sizes", name)
             marks.bars(stream, entity, table, {"found": GREEN, "missed": VERMILION})
-        marks.page(stream, "text/scored", _text(summary_markdown, trial, sizes))
+        marks.page(stream, "text/scored", _text(summary_markdown, trial, bool(sizes)))
 
 
 def _paired(validated: pd.DataFrame, faults: pd.DataFrame) -> pd.DataFrame:
@@ -142,20 +144,18 @@ def _draw(stream: rr.RecordingStream, name: str, own: pd.DataFrame, kinds: pd.Se
         marks.dots(stream, f"{entity}/{part}", frame, [colour], size)
 
 
-def _text(summary: str, trial: int, sizes: dict[str, pd.DataFrame]) -> str:
+def _text(summary: str, trial: int, sized: bool) -> str:
     text = [
         summary.strip(),
         "## What is to be seen",
-        f"**Right, above**, a tab per channel, trial {trial}: the statistic that decided on each "
-        "sample, the deviation from the last good value or from its extrapolation, and the grey "
-        "threshold. *Green* is a fault that was found, *vermilion* one that was missed, *orange* a "
-        "false alarm. A gap raises the threshold; a true step raises alarms until it is confirmed.",
+        f"**Right, above**, a tab per channel, trial {trial}: the surprise of each sample, its "
+        "deviation from the last good value or from the extrapolation, and the grey threshold. "
+        "*Green* is a fault that was found, *vermilion* one that was missed, *orange* a false "
+        "alarm. A gap raises the threshold; a true step raises alarms until it is confirmed.",
     ]
-    if sizes:
-        ends = "; ".join(f"{name}: {table.index[0]:.3g} MW" for name, table in sizes.items())
+    if sized:
         text.append(
             "**Right, below**, a tab per channel: injected spikes of all trials by size, found in "
-            "green and missed in vermilion. Small ones hide in the load's own movement. Width of a "
-            f"group: {ends}."
+            "green and missed in vermilion. Small ones hide in the load's own movement."
         )
     return "\n\n".join(text)
