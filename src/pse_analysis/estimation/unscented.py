@@ -38,6 +38,8 @@ ALPHA_RANGE = (0.02, 1.0)
 """Where adaptive scaling looks for α."""
 ALPHA_TOLERANCE = 1e-3
 MAX_TRIALS = 8
+SLAB = 64
+"""Directions whose points are evaluated at once: what h needs for them stays in the cache."""
 
 
 @dataclass(frozen=True)
@@ -114,28 +116,31 @@ class SigmaPoints:
 
     def spread(self, prior: Prior, chol_P: FloatArray, square: float, rows: IntArray) -> Spread:
         """Odd and even parts of h along the columns of √s L, for some rows of the layout."""
-        n = prior.n
-        step = np.sqrt(square) * np.ascontiguousarray(chol_P[:n, :n])
-        points = np.repeat(prior.x[:, None], 2 * n + 1, axis=1)
-        columns = _run(prior.columns)
-        points[columns, 1 : n + 1] += step
-        points[columns, n + 1 :] -= step
-        y = self.model.h(points)
-        if len(rows) < len(y):
-            y = y[rows]
-        folded = self._folded[rows]
-        if folded.any():
-            centre = y[folded, :1]
-            y[folded] = centre + wrap(y[folded] - centre)
-        odd = y[:, 1 : n + 1] - y[:, n + 1 :]
+        n, m = prior.n, len(rows)
+        whole = m == self.model.shape[0]
+        curved, folded = np.flatnonzero(self._curved[rows]), self._folded[rows]
+        centre = self.model.h(prior.x)[rows]
+        odd, even = np.empty((m, n)), np.empty((len(curved), n))
+        columns, run = _run(prior.columns), _run(curved)
+        for first in range(0, n, SLAB):
+            part = slice(first, min(first + SLAB, n))
+            step = np.sqrt(square) * chol_P[:n, part]
+            width = step.shape[1]
+            points = np.repeat(prior.x[:, None], 2 * width, axis=1)
+            points[columns, :width] += step
+            points[columns, width:] -= step
+            y = self.model.h(points)
+            if not whole:
+                y = y[rows]
+            if folded.any():
+                y[folded] = centre[folded, None] + wrap(y[folded] - centre[folded, None])
+            np.subtract(y[:, :width], y[:, width:], out=odd[:, part])
+            # The even part of a linear row is nothing, and neither is it worth its square.
+            np.add(y[run, :width], y[run, width:], out=even[:, part])
         odd *= 0.5
-        curved = np.flatnonzero(self._curved[rows])
-        # The even part of a linear row is nothing, and neither is it worth its square.
-        bent = y[_run(curved)]
-        even = bent[:, 1 : n + 1] + bent[:, n + 1 :]
         even *= 0.5
-        even -= bent[:, :1]
-        return Spread(square, y[:, 0], odd, curved, even, even.sum(axis=1) / square)
+        even -= centre[run, None]
+        return Spread(square, centre, odd, curved, even, even.sum(axis=1) / square)
 
     def moments(
         self,
@@ -150,10 +155,16 @@ class SigmaPoints:
         n, square, run = prior.n, spread.square, _run(spread.curved)
         # Fortran order is what BLAS reads without a copy; odd.T has it.
         own = blas.dsyrk(1.0 / square, spread.odd.T, trans=1, lower=1)
-        bent = central * np.outer(spread.shift, spread.shift)
-        if len(bent):
+        if len(spread.shift):
+            # A symmetric matrix is its own transpose, in the order that BLAS reads.
             bent = blas.dsyrk(
-                1.0 / square, spread.even.T, trans=1, lower=1, beta=1.0, c=np.asfortranarray(bent)
+                1.0 / square,
+                spread.even.T,
+                trans=1,
+                lower=1,
+                beta=1.0,
+                c=np.outer(central * spread.shift, spread.shift).T,
+                overwrite_c=1,
             )
             own[(run, run) if isinstance(run, slice) else np.ix_(run, run)] += bent
         root = 1.0 / np.sqrt(square)
