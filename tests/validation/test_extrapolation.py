@@ -58,7 +58,7 @@ def last_row(kind: str, k_gamma: float, x: np.ndarray) -> np.ndarray:
 
 
 def test_generated_load_has_the_published_coefficient_and_gain() -> None:
-    x = load((150_000, 1), 2018)
+    x = load((100_001, 1), 2018)
     k, variance = extrapolation.scan(x, np.linspace(-1.0, 2.0, 151))
     gain = extrapolation.gain_percent(variance[50], variance.min(axis=0))
     assert k[0] == pytest.approx(0.5, abs=0.02)
@@ -88,7 +88,7 @@ def test_gain_is_the_square_of_the_autocorrelation_on_any_series() -> None:
         "daily": 30.0 * np.sin(np.arange(n) / 96.0 * 2.0 * np.pi)[:, None] + load((n, 1), 5),
     }
     for name, x in series.items():
-        k, variance = extrapolation.scan(x, np.linspace(-1.0, 1.0, 1001))
+        k, variance = extrapolation.scan(x, np.linspace(-1.0, 1.0, 401))
         d = np.diff(x[:, 0])
         rho = np.sum(d[1:] * d[:-1]) / np.sum(d**2)
         naive = np.mean(d[1:] ** 2)
@@ -130,7 +130,7 @@ def test_sigma_follows_the_time_of_day_where_asked() -> None:
 @pytest.mark.parametrize("kind", ["increment", "extrapolation"])
 @pytest.mark.parametrize(("q", "ratio"), [(0.05, 1.0), (0.05, 5.0), (0.2, 2.0)])
 def test_predicted_rates_come_true_given_good_references(kind: str, q: float, ratio: float) -> None:
-    n, amplitude = 200_000, 6.0
+    n, amplitude = 150_000, 6.0
     sigma = 1.0 if kind == "increment" else math.sqrt(1.0 - RHO**2)
     answer = thresholds.bayes(q, ratio, amplitude / sigma)
     x = load((3, n), 31)
@@ -148,7 +148,7 @@ def test_predicted_rates_come_true_given_good_references(kind: str, q: float, ra
 
 @pytest.mark.parametrize("kind", ["increment", "extrapolation"])
 def test_no_other_threshold_has_a_lower_realised_risk(kind: str) -> None:
-    n, amplitude, q, ratio = 150_000, 6.0, 0.05, 2.0
+    n, amplitude, q, ratio = 100_000, 6.0, 0.05, 2.0
     sigma = 1.0 if kind == "increment" else math.sqrt(1.0 - RHO**2)
     best = float(thresholds.bayes(q, ratio, amplitude / sigma).k)
     x = load((3, n), 41)
@@ -198,7 +198,7 @@ def test_extrapolation_finds_more_errors_at_the_same_realised_false_alarm_rate(r
 @pytest.mark.parametrize("tails", ["gaussian", "heavy"])
 def test_no_gain_is_claimed_without_autocorrelation(tails: str) -> None:
     rng = np.random.default_rng(61)
-    shape = (2_000, 120)
+    shape = (2_000, 100)
     drawn = rng.standard_normal(shape) if tails == "gaussian" else rng.standard_t(3, shape)
     x = np.cumsum(drawn, axis=0)
     assert extrapolation.gains(learn(x, steps(x))).mean() <= 0.01

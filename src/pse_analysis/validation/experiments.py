@@ -27,9 +27,7 @@ _BISECTIONS = 11
 
 def known_structure(n_channel: int, rho: float = 0.5, sigma: float = 1.0) -> Structure:
     """Structure of loads whose increments are AR(1), as if learnt without error."""
-    variance = np.tile(
-        gap_variance(sigma, rho ** np.arange(1, N_LAG + 1), N_LAG), (n_channel, 1)
-    )
+    variance = np.tile(gap_variance(sigma, rho ** np.arange(1, N_LAG + 1), N_LAG), (n_channel, 1))
     return Structure(variance, np.full(n_channel, 10_000), np.zeros(n_channel))
 
 
