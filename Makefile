@@ -39,7 +39,7 @@ cases-all: $(VENV)/.dev
 
 # The notebooks read what the cases left behind. Warnings of notebook machinery are not ours to mend.
 notebook-tests: $(VENV)/.dev cases-all
-	$(if $(NOTEBOOKS),$(BIN)/python -m pytest --nbmake --nbmake-timeout=600 -W default $(NOTEBOOKS),@true)
+	$(if $(NOTEBOOKS),$(BIN)/python -m pytest -n 2 --nbmake --nbmake-timeout=600 -W default $(NOTEBOOKS),@true)
 
 tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 tests
