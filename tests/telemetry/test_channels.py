@@ -90,4 +90,6 @@ def test_injections_that_contain_the_shunt_are_refused(grid: str, level: float):
 def test_without_a_voltage_at_the_bus_nothing_is_said():
     samples, channels = snapshots("ieee30", 1.0, with_shunt=True)
     without = channels[channels.quantity != "vm_pu"]
-    check_shunts(samples, without, library.load("ieee30"))
+    with pytest.raises(TableError):
+        check_shunts(samples, channels, library.load("ieee30"))
+    assert check_shunts(samples, without, library.load("ieee30")) is None

@@ -88,7 +88,10 @@ def test_narrower_types_and_other_resolutions_are_widened(folder: Path):
     rewrite(path, "value", column(path, "value").cast(pa.float32()))
     rewrite(path, "channel", column(path, "channel").dictionary_encode())
     rewrite(path, "trial", column(path, "trial").cast(pa.int64()))
-    telemetry.read_raw(folder)
+    read = telemetry.read_raw(folder).telemetry
+    assert read.time_utc.dt.unit == "us"
+    assert str(read.value.dtype) == "float64"
+    assert str(read.trial.dtype) == "int32"
 
 
 def test_existing_telemetry_is_never_overwritten(written: Path):
