@@ -303,7 +303,13 @@ processes.as_completed = wait
     arguments = command(options, setup=setup)
     arguments[arguments.index("--workers") + 1] = "2"
     process = subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
+        arguments,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+        # A shell that starts the tests in the background lets them ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stdout is not None
     next(line for line in process.stdout if line.strip() == "here")
