@@ -14,8 +14,6 @@ from pse_analysis.measurement import MeasurementModel, wrap
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-MOST_PASSES = 20
-
 
 def linearised(model: MeasurementModel, passes: int = 1) -> Observation:
     """First-order prediction, renewed at the estimate if more than one pass is allowed.

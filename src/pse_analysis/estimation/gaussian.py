@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.errors import Unobservable
 from pse_analysis.estimation import robust
 from pse_analysis.estimation.conditioning import Moments, Prior, condition
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
@@ -296,24 +295,9 @@ def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianF
     inside = np.ix_(columns, columns)
 
     def init(snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
-        m = len(layout)
-        try:
-            solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available)
-        except Unobservable as error:
-            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
-        if not solution.converged:
-            return None, Info.nothing(m, Status.NOT_CONVERGED, "no start from least squares")
-        used = snapshot.available
-        info = Info(
-            Status.OK,
-            solution.iterations,
-            np.nan,
-            0,
-            used,
-            np.where(used, solution.residual, np.nan),
-            np.where(used, snapshot.sigma, np.nan),
-            np.zeros(m),
-        )
+        solution, info = wls.begin(snapshot)
+        if solution is None:
+            return None, info
         return made.begin(solution.x, solution.covariance()[inside], snapshot.time), info
 
     def read(state: GaussianState) -> Voltages:

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, sparse
 
-from pse_analysis.errors import Unobservable
 from pse_analysis.estimation import intervals
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
@@ -163,13 +162,9 @@ def kalman_filter(
         return covariance
 
     def init(snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
-        m = len(layout)
-        try:
-            solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available)
-        except Unobservable as error:
-            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
-        if not solution.converged:
-            return None, Info.nothing(m, Status.NOT_CONVERGED, "no start from least squares")
+        solution, info = wls.begin(snapshot)
+        if solution is None:
+            return None, info
         n = network.n_bus
         voltage = solution.x[n:] * np.exp(1j * solution.x[:n])
         turn = to_rectangular(voltage)
@@ -179,17 +174,6 @@ def kalman_filter(
         older = np.minimum.outer(np.arange(lags + 1), np.arange(lags + 1))
         covariance = np.kron(np.ones_like(older), start) + np.kron(older, walk)
         x = np.tile(np.concatenate([voltage.real, voltage.imag]), lags + 1)
-        used = snapshot.available
-        info = Info(
-            Status.OK,
-            solution.iterations,
-            np.nan,
-            0,
-            used,
-            np.where(used, solution.residual, np.nan),
-            np.where(used, snapshot.sigma, np.nan),
-            np.zeros(m),
-        )
         return KalmanState(x, covariance), info
 
     def linear(

@@ -264,6 +264,27 @@ class WeightedLeastSquares:
             return self.flat_start()
         return np.concatenate([np.angle(voltage), np.abs(voltage)])
 
+    def begin(self, snapshot: Snapshot) -> tuple[WlsSolution | None, Info]:
+        """Start a filter: the estimate of its first snapshot, or None and why there is none."""
+        m = self.model.shape[0]
+        try:
+            solution = self.solve(snapshot.z, snapshot.sigma, snapshot.available)
+        except Unobservable as error:
+            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
+        if not solution.converged:
+            return None, Info.nothing(m, Status.NOT_CONVERGED, "no start from least squares")
+        used = snapshot.available
+        return solution, Info(
+            Status.OK,
+            solution.iterations,
+            np.nan,
+            0,
+            used,
+            np.where(used, solution.residual, np.nan),
+            np.where(used, snapshot.sigma, np.nan),
+            np.zeros(m),
+        )
+
     def _iterate(
         self, x: FloatArray, z: FloatArray, weight: FloatArray, tolerance: float
     ) -> tuple[FloatArray, int, bool]:
