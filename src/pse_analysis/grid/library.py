@@ -10,7 +10,7 @@ import pandas as pd
 from pse_analysis.errors import GridError
 from pse_analysis.grid.network import Network
 
-GRIDS = ("ieee14", "ieee30", "ieee33", "ieee118")
+GRIDS = ("ieee14", "ieee30", "ieee33", "ieee57", "ieee118", "ieee300")
 """Names that `load` knows; where each comes from stands in ``tables/SOURCE.md``."""
 
 
@@ -20,8 +20,8 @@ def load(name: str) -> Network:
     Parameters
     ----------
     name : str
-        ``ieee14``, ``ieee30`` (the IEEE one), ``ieee33`` (Baran and Wu, tie lines open) or
-        ``ieee118``.
+        ``ieee14``, ``ieee30`` (the IEEE one), ``ieee33`` (Baran and Wu, tie lines open),
+        ``ieee57``, ``ieee118`` or ``ieee300``.
 
     Raises
     ------
