@@ -1,4 +1,4 @@
-"""Claim: ieee57 and ieee300 have the solution that IEEE prints, and that of a mended peer's copy."""
+"""Claim: ieee57 and ieee300 have the solution that IEEE prints, and a mended peer copy's."""
 
 from __future__ import annotations
 
