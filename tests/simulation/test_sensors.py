@@ -142,6 +142,37 @@ def test_samples_arrive_within_the_stated_delay_and_one_device_sends_together():
     assert clean.groupby(["trial", "time_utc"]).arrival_utc.nunique().max() == 1
 
 
+def wandering() -> SensorParams:
+    return SensorParams(
+        "scada", ("p_mw", "q_mvar"), ("branch/7-8", "branch/24-25"), 0.01, 60.0,
+        delay_s=30.0, jitter_s=20.0, wander_s=200.0, wander_time_s=1800.0,
+    )  # fmt: skip
+
+
+def test_a_wandering_delay_drifts_by_element_and_leaves_samples_in_order():
+    minutes = 40_000
+    time = np.arange(0, (minutes + 1) * 60_000_000, 60_000_000, dtype=np.int64)
+    x = np.broadcast_to(
+        np.concatenate([np.zeros(33), np.linspace(1.0, 0.95, 33)])[:, None], (66, len(time))
+    )
+    samples, _ = read(Truth(time, x, x[:33], x[:33]), wandering())
+    late = ((samples.arrival - samples.sampled) / 1e6).reshape(4, -1)
+    np.testing.assert_array_equal(late[0], late[1])
+    np.testing.assert_array_equal(late[2], late[3])
+    assert (np.diff(samples.arrival.reshape(4, -1), axis=1) > 0).all()
+    assert late.min() >= 30.0
+    assert late.max() <= 250.0
+    # U(0, 200) of the drift and U(0, 20) of the jitter; some 500 independent values each.
+    drift = late - late.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(late.mean(axis=1), 140.0, atol=12.0)
+    np.testing.assert_allclose(drift.std(axis=1), np.hypot(200.0, 20.0) / np.sqrt(12.0), rtol=0.08)
+    assert abs(np.corrcoef(late[0], late[2])[0, 1]) < 0.2
+    lag = 15
+    fraction = 2.0 * lag * 60.0 / 1800.0
+    found = np.corrcoef(late[::2, lag:].ravel(), late[::2, :-lag].ravel())[0, 1]
+    assert found == pytest.approx((1 + fraction) * np.exp(-fraction), abs=0.08)
+
+
 def test_a_source_without_a_clock_is_stamped_at_arrival():
     group = dataclasses.replace(SENSORS[1], stamp="arrival")
     raw = make(CLEAN, sensors=(group,), trials=1)
@@ -189,9 +220,16 @@ def test_a_channel_given_twice_is_refused():
         simulate(feeder(), curves(), STUDY, SimulateParams(seed=1, sensors=(SENSORS[0],) * 2))
 
 
+@pytest.mark.parametrize("change", [{"jitter_s": 45.0}, {"wander_time_s": 600.0}])
+def test_delays_by_which_samples_would_overtake_each_other_are_refused(change):
+    with pytest.raises(ParameterError, match="samples overtake each other"):
+        dataclasses.replace(wandering(), **change)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"wander_time_s": 0.0}, "wander_time_s > 0"),
         ({"sigma": 0.0}, "sigma > 0, received 0.0"),
         ({"source": "radar"}, "source in scada, pmu, ami"),
         ({"quantities": ("vm",)}, "quantities in vm_pu"),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+from scipy.special import ndtr
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid import power_flow
@@ -191,7 +192,7 @@ def observe(
     first_channel
         Row of ``table``'s first channel in the table of all channels.
     rng
-        Of noise and jitter.
+        Of noise, jitter and wander.
 
     Returns
     -------
@@ -214,8 +215,10 @@ def observe(
         block[angle] = _fold(block[angle])
 
     _, device = np.unique(table["element"].to_numpy(dtype=str), return_inverse=True)
-    jitter = rng.random((int(device.max()) + 1, len(sampled)))[device] * group.jitter_s
-    arrival = sampled + np.rint((group.delay_s + jitter) * SECOND).astype(np.int64)
+    late = group.delay_s + group.jitter_s * rng.random((int(device.max()) + 1, len(sampled)))
+    if group.wander_s:
+        late += group.wander_s * _wander(late.shape, group.period_s / group.wander_time_s, rng)
+    arrival = sampled + np.rint(late[device] * SECOND).astype(np.int64)
     n, m = value.shape
     return Samples(
         channel=np.repeat(np.arange(first_channel, first_channel + n, dtype=np.int64), m),
@@ -228,6 +231,26 @@ def observe(
         size=np.zeros(n * m),
         taken=np.zeros(n * m, dtype=bool),
     )
+
+
+def _wander(shape: tuple[int, int], step: float, rng: np.random.Generator) -> FloatArray:
+    """Smooth stationary processes that are uniform on (0, 1) at every instant; rows independent.
+
+    The normal law of a Gaussian process with autocorrelation (1 + a) exp(-a), a = 2·lag/time:
+    differentiable, because a queue fills and empties at a bounded rate. Its integral is ``time``;
+    ``step`` is relative to it.
+    """
+    a = 2.0 * step
+    # Exact transition of the process and its rate, both scaled to variance 1.
+    transition = np.exp(-a) * np.array([[1.0 + a, a], [-a, 1.0 - a]])
+    noise = np.linalg.cholesky(np.eye(2) - transition @ transition.T)
+    drawn = rng.standard_normal((shape[1], 2, shape[0]))
+    state = drawn[0]
+    value = np.empty((shape[1], shape[0]))
+    for k in range(shape[1]):
+        state = state if k == 0 else transition @ state + noise @ drawn[k]
+        value[k] = state[0]
+    return np.asarray(ndtr(value.T))
 
 
 def _fold(angle: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -143,8 +144,12 @@ class SensorParams:
     aggregation
         ``instant``, or ``mean`` over the truth instants in (stamp − period, stamp].
     delay_s, jitter_s
-        A sample arrives delay + U(0, jitter) after its sampling time; all quantities that one
-        element measures arrive together. [s]
+        A sample arrives delay + U(0, jitter) after its sampling time, the jitter of each sample
+        being its own; all quantities that one element measures arrive together. [s]
+    wander_s, wander_time_s
+        Range of a part of the delay that drifts between 0 and ``wander_s``, each element's on its
+        own, as congestion of a network does, and the integral of its autocorrelation. With it
+        jitter and drift must leave the samples in their order. [s]
     stamp
         ``sampling``: the time stamp is the sampling time. ``arrival``: the source has no clock, and
         the master station stamps what arrives.
@@ -168,6 +173,8 @@ class SensorParams:
     aggregation: Literal["instant", "mean"] = "instant"
     delay_s: float = 0.0
     jitter_s: float = 0.0
+    wander_s: float = 0.0
+    wander_time_s: float = 1800.0
     stamp: Literal["sampling", "arrival"] = "sampling"
     sign: Literal[1, -1] = 1
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -183,8 +190,22 @@ class SensorParams:
         _require(bool(self.quantities) and bool(self.at), where, "quantities and at", self.at)
         _require(self.sigma > 0, where, "sigma > 0", self.sigma)
         _require(self.period_s > 0, where, "period_s > 0", self.period_s)
-        for name in ("phase_s", "delay_s", "jitter_s", "limit_factor"):
+        for name in ("phase_s", "delay_s", "jitter_s", "wander_s", "limit_factor"):
             _require(getattr(self, name) >= 0, where, f"{name} ≥ 0", getattr(self, name))
+        _require(self.wander_time_s > 0, where, "wander_time_s > 0", self.wander_time_s)
+        if self.wander_s:
+            # Five standard deviations of the drift over a period, where it drifts fastest.
+            fraction = 2.0 * self.period_s / self.wander_time_s
+            changed = math.sqrt(2.0 - 2.0 * (1.0 + fraction) * math.exp(-fraction))
+            drift = self.wander_s * min(1.0, 5.0 * changed / math.sqrt(2.0 * math.pi))
+            _require(
+                self.jitter_s + drift < self.period_s,
+                where,
+                f"jitter_s + drift over a period ({drift:.0f} s) < period_s = {self.period_s:g}, "
+                "or samples overtake each other: lower jitter_s or wander_s, or raise "
+                "wander_time_s",
+                self.jitter_s,
+            )
 
 
 @dataclass(frozen=True)
