@@ -2,7 +2,8 @@
 
 What had arrived by each instant, with its age and the σ that age adds, eq. (3) of [qi2025]. A
 variant may correct the stamps of sources without a clock before, and let forecasts stand for
-readings of slow meters that have grown old, eq. (4).
+readings of slow meters that have grown old, eq. (4). An instant may wait for what arrives late, and
+then a source that is sampled often enough is interpolated to it.
 """
 
 from __future__ import annotations
@@ -17,19 +18,16 @@ import pandas as pd
 from pse_analysis.alignment import dtw, pseudo_measurements
 from pse_analysis.alignment.dtw import TimeParams
 from pse_analysis.alignment.pseudo_measurements import PseudoParams
+from pse_analysis.alignment.samples import MICROSECOND, Samples, first_use
 from pse_analysis.alignment.stamps import SamplingTimes, sampling_times
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import IA, VA, Model, SensorLayout, standard_deviation, wrap
 from pse_analysis.parameters import Study
-from pse_analysis.vocabulary import Origin, check, usable
+from pse_analysis.vocabulary import Origin, check
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-
-MICROSECOND = 1_000_000
-FEWEST_INCREMENTS = 12
-"""History shorter than this tells nothing about how fast a channel moves."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,15 @@ class Variant:
         How sampling times of sources without a clock are recovered.
     pseudo : {"none", "hold", "holt", "profile", "ar"}
         What stands for old readings of slow meters; ``none`` keeps the readings.
+    face_value : tuple of str
+        Sources whose readings keep the σ of their meter however old they are, as in a system that
+        fuses nothing.
     """
 
     name: str
     time: dtw.Method = "none"
     pseudo: pseudo_measurements.Method = "none"
+    face_value: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,11 @@ class AlignParams:
         carry.
     variants : tuple of Variant
         Several results side by side.
+    latency_s : float
+        How long after it an instant is estimated, so that samples taken by then arrive. [s]
+    interpolate : tuple of str
+        Sources brought to an instant on the line between the samples around it, where the later one
+        has arrived; by its last sample otherwise.
     max_age_s : dict of str to float
         Age beyond which a sample is no longer used, by source. [s]
     default_max_age_s : float
@@ -76,6 +83,8 @@ class AlignParams:
 
     variant: str = "last"
     variants: tuple[Variant, ...] = ()
+    latency_s: float = 0.0
+    interpolate: tuple[str, ...] = ()
     max_age_s: dict[str, float] = field(default_factory=dict)
     default_max_age_s: float = 3600.0
     growth: Literal["history", "none"] = "history"
@@ -89,6 +98,8 @@ class AlignParams:
                 raise ParameterError(
                     f"[align.variants] the name {name!r} stands twice: give each its own"
                 )
+        if not self.latency_s >= 0:
+            raise ParameterError(f"[align] expected latency_s ≥ 0, received {self.latency_s}")
 
 
 def align(
@@ -98,7 +109,7 @@ def align(
     study: Study,
     params: AlignParams | None = None,
 ) -> pd.DataFrame:
-    """Bring usable samples to the estimation instants by last value.
+    """Bring usable samples to the estimation instants.
 
     Parameters
     ----------
@@ -115,8 +126,9 @@ def align(
     Returns
     -------
     DataFrame
-        Table ``aligned``: per trial, instant and channel the usable sample of latest time stamp
-        among those that had *arrived*; absent where none is young enough.
+        Table ``aligned``: per variant, trial, instant and channel the usable sample of latest time
+        stamp among those that had *arrived* when the instant is estimated; absent where none is
+        young enough.
 
     Raises
     ------
@@ -126,8 +138,9 @@ def align(
     Notes
     -----
     A channel that moves as a random walk with variance rate r leaves, at age a and for means over
-    W, the variance r (a + W/3): that is added to the sample's own. r comes from increments between
-    consecutive samples before the study, so nothing after an instant is known at it.
+    W, the variance r (a + W/3), and a fraction u between two samples that lie g apart the variance
+    r g u (1-u): that is added to the samples' own. r comes from samples before the study, so
+    nothing after an instant is known at it.
     """
     params = params or AlignParams()
     layout = SensorLayout.from_channels(channels, model)
@@ -138,6 +151,7 @@ def align(
             f"validated: channel {name!r} is not in the channels table: add it there, or drop it"
         )
     instants = instants_of(study)
+    wait = round(params.latency_s * MICROSECOND)
     source = channels["source"].to_numpy(dtype=object)
     start = start_of(study)
     stamps: dict[str, SamplingTimes | None] = {"none": None}
@@ -150,16 +164,17 @@ def align(
                     'of a grid, but the case is about a machine: use time = "none"'
                 )
             stamps[variant.time] = sampling_times(
-                validated, layout, source, model, instants, start, params.time, variant.time
+                validated, layout, source, model, instants + wait, start, params.time, variant.time
             )
-        samples = _usable_in_order(validated, column, layout, stamps[variant.time])
-        tables.append(_fuse(samples, instants, layout, source, study, params, variant))
+        samples = Samples.of(validated, column, layout, stamps[variant.time])
+        tables.append(_fuse(samples, instants, wait, layout, source, study, params, variant))
     return check("aligned", pd.concat(tables, ignore_index=True))
 
 
 def _fuse(
-    samples: _Samples,
+    samples: Samples,
     instants: IntArray,
+    wait: int,
     layout: SensorLayout,
     source: npt.NDArray[np.object_],
     study: Study,
@@ -167,19 +182,40 @@ def _fuse(
     variant: Variant,
 ) -> pd.DataFrame:
     """The aligned rows of one variant."""
-    rate = _movement(samples, layout, study) if params.growth == "history" else None
     limit = np.array([params.max_age_s.get(s, params.default_max_age_s) for s in source])
-    at, row = _latest(samples, instants)
+    at, row = samples.latest(instants, wait)
     age = (instants[at] - samples.time[row]) / MICROSECOND
     young = age <= limit[samples.column[row]]
     at, row, age = at[young], row[young], age[young]
     place = samples.column[row]
     value = samples.value[row]
-    own = standard_deviation(value, layout.sigma[place], layout.relative[place])
+    own = samples.noise(row, layout)
     grown = np.zeros(len(row))
-    if rate is not None:
+    rate = np.zeros(int(samples.group.max(initial=-1)) + 1)
+    if params.growth == "history":
+        rate = samples.movement(layout, start_of(study), study.step_s)
         grown = np.sqrt(rate[samples.group[row]] * (age + layout.window_s[place] / 3.0))
-    origin = np.where(_first_use(at, row), str(Origin.MEASURED), str(Origin.HELD)).astype(object)
+        grown[np.isin(source, variant.face_value)[place]] = 0.0
+    first = first_use(at, row)
+    stands = row.copy()
+
+    between = np.isin(source, params.interpolate)[place] & (layout.window_s[place] == 0)
+    between &= samples.following(at, row, instants, wait)
+    if between.any():
+        left, right = row[between], row[between] + 1
+        gap = (samples.time[right] - samples.time[left]) / MICROSECOND
+        share = age[between] / gap
+        change = samples.value[right] - samples.value[left]
+        change = np.where(np.isin(layout.quantity[place[between]], (VA, IA)), wrap(change), change)
+        value[between] += share * change
+        bridge = rate[samples.group[left]] * gap * share * (1 - share)
+        noise = np.hypot((1 - share) * own[between], share * samples.noise(right, layout))
+        # The value is one of the instant: what is left of the movement is not the age's doing.
+        own[between], grown[between], age[between] = np.sqrt(noise**2 + bridge), 0.0, 0.0
+        first[between] = first_use(at[between], right)
+        stands[between] = np.where(share > 0.5, right, left)
+
+    origin = np.where(first, str(Origin.MEASURED), str(Origin.HELD)).astype(object)
     if variant.pseudo != "none":
         old = np.isin(source, params.pseudo.sources)[place] & (age > params.pseudo.window_s)
         value[old], own[old] = _forecasts(
@@ -187,31 +223,30 @@ def _fuse(
         )
         origin[old], grown[old], age[old] = str(Origin.PSEUDO), 0.0, 0.0
     order = np.lexsort((place, at, samples.trial[row]))
-    at, row, age, place = at[order], row[order], age[order], place[order]
-    value, own, grown, origin = value[order], own[order], grown[order], origin[order]
     times = pd.DatetimeIndex(instants.astype("datetime64[us]"), tz="UTC")
-    taken = pd.DatetimeIndex(samples.time.astype("datetime64[us]"), tz="UTC")
+    stands, place = stands[order], place[order]
+    taken = pd.DatetimeIndex(samples.time[stands].astype("datetime64[us]"), tz="UTC")
     return pd.DataFrame(
         {
             "variant": variant.name,
-            "trial": samples.trial[row].astype(np.int32),
-            "time_utc": times[at],
+            "trial": samples.trial[stands].astype(np.int32),
+            "time_utc": times[at[order]],
             "channel": np.asarray(layout.channel, dtype=object)[place],
-            "value_pu": value,
-            "sigma_pu": np.hypot(own, grown),
-            "sigma_age_pu": grown,
-            "origin": origin,
-            "sample_utc": taken[row],
-            "time_confidence": samples.confidence[row],
-            "age_s": age,
-            "flag": samples.flag[row],
-            "reasons": samples.reasons[row],
+            "value_pu": value[order],
+            "sigma_pu": np.hypot(own, grown)[order],
+            "sigma_age_pu": grown[order],
+            "origin": origin[order],
+            "sample_utc": taken,
+            "time_confidence": samples.confidence[stands],
+            "age_s": age[order],
+            "flag": samples.flag[stands],
+            "reasons": samples.reasons[stands],
         }
     )
 
 
 def _forecasts(
-    samples: _Samples,
+    samples: Samples,
     at: IntArray,
     row: IntArray,
     instants: IntArray,
@@ -264,21 +299,6 @@ def _period(time: IntArray) -> int:
     return int(np.median(np.diff(time))) if len(time) > 1 else 900 * MICROSECOND
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """Usable samples sorted by group (trial and channel), then arrival; times in µs."""
-
-    group: IntArray
-    trial: IntArray
-    column: IntArray
-    time: IntArray
-    arrival: IntArray
-    confidence: FloatArray
-    value: FloatArray
-    flag: npt.NDArray[np.int8]
-    reasons: npt.NDArray[np.int32]
-
-
 def instants_of(study: Study) -> IntArray:
     """Instants of history and study. [µs since 1970 UTC]"""
     start, end, history = (
@@ -293,100 +313,3 @@ def instants_of(study: Study) -> IntArray:
 def start_of(study: Study) -> int:
     """First instant of the study. [µs since 1970 UTC]"""
     return int(pd.Timestamp(study.start).tz_convert("UTC").value // 1000)
-
-
-def _microseconds(times: pd.Series) -> IntArray:
-    naive = times.dt.tz_convert("UTC").dt.tz_localize(None)
-    return np.asarray(naive.to_numpy().astype("datetime64[us]").astype(np.int64))
-
-
-def _usable_in_order(
-    validated: pd.DataFrame, column: IntArray, layout: SensorLayout, stamps: SamplingTimes | None
-) -> _Samples:
-    """Usable samples, in per unit, that are not older than one which arrived before them."""
-    value = validated["corrected"].to_numpy(dtype=float) * layout.scale[column]
-    keep = usable(validated["flag"].to_numpy()) & np.isfinite(value)
-    rows = validated[keep]
-    trial = rows["trial"].to_numpy(dtype=np.int64)
-    place = np.asarray(column[keep], dtype=np.int64)
-    time = _microseconds(rows["time_utc"])
-    came = rows["arrival_utc"].isna().to_numpy()
-    confidence = np.ones(len(rows))
-    arrival = np.where(came, time, _microseconds(rows["arrival_utc"].fillna(rows["time_utc"])))
-    # A stamp ahead of its arrival, from a clock that is fast or wrong, waits for its time.
-    arrival = np.maximum(arrival, time)
-    if stamps is not None:
-        time, confidence = stamps.time[keep], stamps.confidence[keep]
-    order = np.lexsort((rows["seq"].to_numpy(), arrival, place, trial))
-    _, group = np.unique(np.stack([trial, place]), axis=1, return_inverse=True)
-    group = np.ravel(group)[order].astype(np.int64)
-    newest = pd.Series(time[order]).groupby(group).cummax().to_numpy()
-    begins = np.concatenate([[True], group[1:] != group[:-1]]) if len(group) else np.zeros(0, bool)
-    advances = begins | np.concatenate([[True], newest[1:] > newest[:-1]])[: len(group)]
-    order, group = order[advances], group[advances]
-    return _Samples(
-        group=group,
-        trial=trial[order],
-        column=place[order],
-        time=time[order],
-        arrival=arrival[order],
-        confidence=confidence[order],
-        value=value[keep][order],
-        flag=rows["flag"].to_numpy(dtype=np.int8)[order],
-        reasons=rows["reasons"].to_numpy(dtype=np.int32)[order],
-    )
-
-
-def _latest(samples: _Samples, instants: IntArray) -> tuple[IntArray, IntArray]:
-    """For every group and instant the last sample that had arrived: (instant, sample) pairs."""
-    if not len(samples.group):
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    begin = np.unique(samples.group, return_index=True)[1]
-    end = np.append(begin[1:], len(samples.group))
-    at, row = [], []
-    for b, e in zip(begin, end, strict=True):
-        last = np.searchsorted(samples.arrival[b:e], instants, side="right") - 1
-        known = np.flatnonzero(last >= 0)
-        at.append(known)
-        row.append(b + last[known])
-    return np.concatenate(at), np.concatenate(row)
-
-
-def _first_use(at: IntArray, row: IntArray) -> npt.NDArray[np.bool_]:
-    """Whether a sample stands at its first instant, for rows in any order."""
-    first = np.zeros(len(row), dtype=bool)
-    order = np.lexsort((at, row))
-    first[order[np.unique(row[order], return_index=True)[1]]] = True
-    return first
-
-
-def _movement(samples: _Samples, layout: SensorLayout, study: Study) -> FloatArray:
-    """Variance rate of every group before the study. [p.u.²/s]
-
-    Without enough history a channel is taken to move by its own σ per step.
-    """
-    n_group = int(samples.group.max(initial=-1)) + 1
-    start = start_of(study)
-    same = samples.group[1:] == samples.group[:-1]
-    past = same & (samples.arrival[1:] < start)
-    group, place = samples.group[1:][past], samples.column[1:][past]
-    change = np.diff(samples.value)[past]
-    angular = np.isin(layout.quantity[place], (VA, IA))
-    change = np.where(angular, wrap(change), change)
-    elapsed = np.diff(samples.time)[past] / MICROSECOND
-    sigma = standard_deviation(samples.value[1:][past], layout.sigma[place], layout.relative[place])
-    span = np.maximum(elapsed - layout.window_s[place] / 3.0, 1e-3)
-    count = np.bincount(group, minlength=n_group)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        moved = np.bincount(group, weights=change**2 - 2.0 * sigma**2, minlength=n_group)
-        rate = np.maximum(moved, 0.0) / np.bincount(group, weights=span, minlength=n_group)
-    little = count < FEWEST_INCREMENTS
-    if little.any():
-        first = np.searchsorted(samples.group, np.flatnonzero(little))
-        own = standard_deviation(
-            samples.value[first],
-            layout.sigma[samples.column[first]],
-            layout.relative[samples.column[first]],
-        )
-        rate[little] = own**2 / np.maximum(study.step_s, 1.0)
-    return np.asarray(rate)
