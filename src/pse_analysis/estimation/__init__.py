@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import composition, machine, process, screening
+from pse_analysis.estimation import composition, load_learning, machine, process, screening
 from pse_analysis.estimation.composition import Composition
 from pse_analysis.estimation.estimator import Estimated, Estimator, Record, States, record, run
 from pse_analysis.estimation.kalman import kalman_filter
@@ -137,7 +137,9 @@ def _build_plain(
         if method.noise == "scalar"
         else process.load_noise(
             network,
-            process.learn_load(history, layout, network, study.step_s, source=method.source_sigma),
+            load_learning.learn_load(
+                history, layout, network, study.step_s, source=method.source_sigma
+            ),
         )
     )
     if method.filter in ("ukf", "ekf"):
