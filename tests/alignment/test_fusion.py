@@ -228,7 +228,7 @@ def test_channel_without_history_moves_by_its_own_sigma_per_step() -> None:
     np.testing.assert_allclose(table["sigma_age_pu"], expected)
 
 
-# --- waiting and interpolating ----------------------------------------------------------------------
+# --- waiting and interpolating --------------------------------------------------------------------
 
 
 def test_an_instant_that_waits_sees_what_arrives_late_but_nothing_taken_after_it() -> None:

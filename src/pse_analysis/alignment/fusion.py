@@ -139,8 +139,9 @@ def align(
     -----
     A channel that moves as a random walk with variance rate r leaves, at age a and for means over
     W, the variance r (a + W/3), and a fraction u between two samples that lie g apart the variance
-    r g u (1-u): that is added to the samples' own. r comes from samples before the study, so
-    nothing after an instant is known at it.
+    r g u (1-u): that is added to the samples' own, and r times the spread that is left of a
+    recovered sampling time. r comes from samples before the study, so nothing after an instant is
+    known at it.
     """
     params = params or AlignParams()
     layout = SensorLayout.from_channels(channels, model)
@@ -192,8 +193,11 @@ def _fuse(
     own = samples.noise(row, layout)
     grown = np.zeros(len(row))
     rate = np.zeros(int(samples.group.max(initial=-1)) + 1)
+    # A stamp that is off by δ reads a walk that has moved by r |δ|.
+    doubt = (1.0 - samples.confidence) * params.time.largest_delay_s / np.sqrt(12.0)
     if params.growth == "history":
         rate = samples.movement(layout, start_of(study), study.step_s)
+        own = np.sqrt(own**2 + rate[samples.group[row]] * doubt[row])
         grown = np.sqrt(rate[samples.group[row]] * (age + layout.window_s[place] / 3.0))
         grown[np.isin(source, variant.face_value)[place]] = 0.0
     first = first_use(at, row)
@@ -209,7 +213,10 @@ def _fuse(
         change = np.where(np.isin(layout.quantity[place[between]], (VA, IA)), wrap(change), change)
         value[between] += share * change
         bridge = rate[samples.group[left]] * gap * share * (1 - share)
-        noise = np.hypot((1 - share) * own[between], share * samples.noise(right, layout))
+        late = np.sqrt(
+            samples.noise(right, layout) ** 2 + rate[samples.group[right]] * doubt[right]
+        )
+        noise = np.hypot((1 - share) * own[between], share * late)
         # The value is one of the instant: what is left of the movement is not the age's doing.
         own[between], grown[between], age[between] = np.sqrt(noise**2 + bridge), 0.0, 0.0
         first[between] = first_use(at[between], right)
