@@ -19,7 +19,7 @@ from pse_analysis.alignment import dtw, pseudo_measurements
 from pse_analysis.alignment.dtw import TimeParams
 from pse_analysis.alignment.pseudo_measurements import PseudoParams
 from pse_analysis.alignment.samples import MICROSECOND, Samples, first_use
-from pse_analysis.alignment.stamps import SamplingTimes, sampling_times
+from pse_analysis.alignment.stamps import sampling_times
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import IA, VA, Model, SensorLayout, standard_deviation, wrap
@@ -155,19 +155,23 @@ def align(
     wait = round(params.latency_s * MICROSECOND)
     source = channels["source"].to_numpy(dtype=object)
     start = start_of(study)
-    stamps: dict[str, SamplingTimes | None] = {"none": None}
+    stamped: dict[str, Samples] = {}
     tables = []
     for variant in params.variants or (Variant(params.variant),):
-        if variant.time not in stamps:
-            if not isinstance(model, Network):
-                raise ParameterError(
-                    f"[align.variants] {variant.name!r}: sampling times come from currents "
-                    'of a grid, but the case is about a machine: use time = "none"'
-                )
-            stamps[variant.time] = sampling_times(
-                validated, layout, source, model, instants + wait, start, params.time, variant.time
-            )
-        samples = Samples.of(validated, column, layout, stamps[variant.time])
+        if variant.time not in stamped:
+            stamps = None
+            if variant.time != "none":
+                if not isinstance(model, Network):
+                    raise ParameterError(
+                        f"[align.variants] {variant.name!r}: sampling times come from currents "
+                        'of a grid, but the case is about a machine: use time = "none"'
+                    )
+                stamps = sampling_times(
+                    validated, layout, source, model, instants + wait, start, params.time,
+                    variant.time,
+                )  # fmt: skip
+            stamped[variant.time] = Samples.of(validated, column, layout, stamps)
+        samples = stamped[variant.time]
         tables.append(_fuse(samples, instants, wait, layout, source, study, params, variant))
     return check("aligned", pd.concat(tables, ignore_index=True))
 

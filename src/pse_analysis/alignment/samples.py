@@ -92,8 +92,8 @@ class Samples:
         if stamps is not None:
             time, confidence = stamps.time[keep], stamps.confidence[keep]
         order = np.lexsort((rows["seq"].to_numpy(), arrival, place, trial))
-        _, group = np.unique(np.stack([trial, place]), axis=1, return_inverse=True)
-        group = np.ravel(group)[order].astype(np.int64)
+        _, group = np.unique(trial[order] * len(layout) + place[order], return_inverse=True)
+        group = group.astype(np.int64)
         newest = pd.Series(time[order]).groupby(group).cummax().to_numpy()
         begins = np.concatenate([[True], group[1:] != group[:-1]])[: len(group)]
         advances = begins | np.concatenate([[True], newest[1:] > newest[:-1]])[: len(group)]

@@ -31,6 +31,8 @@ _DAY = 86_400_000_000
 
 TURNS = {"degree": 360.0, "rad": 2.0 * np.pi}
 """Full turn of an angle in the units it may have."""
+LEARNING = frozenset({"increment", "extrapolation", "stuck"})
+"""Checks that need to know how a channel usually moves."""
 FOLDED = (Quantity.VA_DEGREE, Quantity.IA_DEGREE)
 """Angles that are known up to full turns; a rotor's is not."""
 
@@ -165,7 +167,9 @@ def _screen_lanes(
         past &= ~(x < limits.lower) & ~(x > limits.upper)
         depth = int(np.flatnonzero(past.any(axis=1)).max(initial=-1)) + 1
         seen = unwound(np.where(past[:depth], x[:depth], np.nan), turn[lanes])
-        structure = learn(seen, t[:depth], bins=None if bins is None else bins[:depth], n_bin=n_bin)
+        if any(not LEARNING.isdisjoint(rule.checks or ()) for rule in chosen):
+            kept = None if bins is None else bins[:depth]
+            structure = learn(seen, t[:depth], bins=kept, n_bin=n_bin)
         noise = noise * np.where(relative[lanes], _typical(seen), 1.0)
         if any(rule.k == "scan" for rule in chosen):
             scan_k, _ = extrapolation.scan(seen, time=t[:depth])
