@@ -2,17 +2,122 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cache, cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
-from pse_analysis.estimation.robust import Judge, Suspicion
+from pse_analysis.estimation.robust import Suspicion
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
+
+Verdict = Callable[[Suspicion], FloatArray]
+"""Inflation φ (m,) of the noise that an innovation calls for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before a snapshot.
+
+    Attributes
+    ----------
+    s, P : (N,), (N, N) ndarray
+    x : (2N_bus,) ndarray
+        [θ; |V|] of s, with the angles that are fixed.
+    columns : (n,) ndarray of int
+        Place of s's first n entries in x.
+    carried : (N, N) ndarray, optional
+        Lower triangular root of P, where the filter carries one.
+    """
+
+    s: FloatArray
+    P: FloatArray
+    x: FloatArray
+    columns: IntArray
+    carried: FloatArray | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of estimated voltages; s holds their slopes behind them."""
+        return len(self.columns)
+
+    @cached_property
+    def chol_P(self) -> FloatArray:
+        """Lower triangular root of P. (N, N)"""
+        return cholesky(self.P) if self.carried is None else self.carried
+
+    def filled(self, s: FloatArray) -> FloatArray:
+        """[θ; |V|] of another s."""
+        x = self.x.copy()
+        x[self.columns] = s[: self.n]
+        return x
+
+
+class Posterior(NamedTuple):
+    """What is known after a snapshot.
+
+    Attributes
+    ----------
+    s, P : (N,), (N, N) ndarray
+    variance : (m,) ndarray
+        S_ii before inflation.
+    inflation : (m,) ndarray
+        φ.
+    nis : float
+        ηᵀ(S + φR)⁻¹η.
+    chol_P : (N, N) ndarray, optional
+        Lower triangular root of P, if it is to be carried on.
+    """
+
+    s: FloatArray
+    P: FloatArray
+    variance: FloatArray
+    inflation: FloatArray
+    nis: float
+    chol_P: FloatArray | None = None
+
+
+class Predicted(Protocol):
+    """A prediction of the measurements, which knows how to condition on them."""
+
+    @property
+    def mean(self) -> FloatArray:
+        """ŷ. (m,)"""
+
+    @property
+    def tuned(self) -> float:
+        """What the observation remembers for the next step."""
+
+    def condition(
+        self, prior: Prior, innovation: FloatArray, noise: FloatArray, verdict: Verdict | None
+    ) -> Posterior:
+        """Condition on an innovation, with the noise that a verdict leaves.
+
+        Parameters
+        ----------
+        prior : Prior
+        innovation : (m,) ndarray
+            η.
+        noise : (m,) ndarray
+            Diagonal of R.
+        verdict : Verdict, optional
+            Everything is believed without one.
+
+        Returns
+        -------
+        Posterior
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If S is not positive definite.
+        """
 
 
 class Moments(NamedTuple):
@@ -35,136 +140,90 @@ class Moments(NamedTuple):
     cross: FloatArray
     tuned: float = 0.0
 
+    def condition(
+        self, prior: Prior, innovation: FloatArray, noise: FloatArray, verdict: Verdict | None
+    ) -> Posterior:
+        """Condition on an innovation, with the noise that a verdict leaves; see `Predicted`.
 
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """What is known before a snapshot.
-
-    Attributes
-    ----------
-    s, P : (N,), (N, N) ndarray
-    x : (2N_bus,) ndarray
-        [θ; |V|] of s, with the angles that are fixed.
-    columns : (n,) ndarray of int
-        Place of s's first n entries in x.
-    """
-
-    s: FloatArray
-    P: FloatArray
-    x: FloatArray
-    columns: IntArray
-
-    @property
-    def n(self) -> int:
-        """Number of estimated voltages; s holds their slopes behind them."""
-        return len(self.columns)
-
-    def filled(self, s: FloatArray) -> FloatArray:
-        """[θ; |V|] of another s."""
-        x = self.x.copy()
-        x[self.columns] = s[: self.n]
-        return x
+        Notes
+        -----
+        With S = L Lᵀ and X = C L⁻ᵀ: K η = X (L⁻¹η) and P - K S Kᵀ = P - X Xᵀ, a symmetric product.
+        """
+        variance = np.diagonal(self.own) + noise
+        chol_S = factor(self.own, variance)
+        white = solve(chol_S, innovation)
+        nis = float(white @ white)
+        inflation = np.zeros(len(noise))
+        if verdict is not None:
+            inflation = verdict(Suspicion(innovation, variance, noise, chol_S, nis))
+        if inflation.any():
+            chol_S = factor(self.own, variance + inflation * noise)
+            white = solve(chol_S, innovation)
+            nis = float(white @ white)
+        X = blas.dtrsm(1.0, chol_S, self.cross, side=1, lower=1, trans_a=1)
+        # P is symmetric, so that its transpose is itself in the order that BLAS reads.
+        lower = blas.dsyrk(-1.0, X, beta=1.0, c=prior.P.T, lower=1)
+        return Posterior(prior.s + X @ white, symmetric(lower), variance, inflation, nis)
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:
     """Lower Cholesky factor of a covariance that rounding may have made a little indefinite.
 
-    Reads the lower triangle; above the diagonal the result is zero. If the factorisation fails,
-    the diagonal is raised by the smallest of 1e-14, 1e-12, … 1e-6 of itself that mends it.
+    Above the diagonal the result is zero. If the factorisation fails, the diagonal is raised by the
+    smallest of 1e-14, 1e-12, … 1e-6 of itself that mends it.
+
+    Parameters
+    ----------
+    matrix : (n, n) ndarray
+        Symmetric.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If not even that helps.
     """
-    factor, failed = lapack.dpotrf(matrix, lower=1, clean=1)
+    # Its transpose is itself, in the order that LAPACK reads.
+    found, failed = lapack.dpotrf(matrix.T, lower=1, clean=1)
     for power in (-14, -12, -10, -8, -6):
         if not failed:
-            return np.asarray(factor)
+            return np.asarray(found)
         raised = matrix + np.diag(10.0**power * np.diagonal(matrix))
-        factor, failed = lapack.dpotrf(raised, lower=1, clean=1)
+        found, failed = lapack.dpotrf(raised.T, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("covariance is not positive definite")
-    return np.asarray(factor)
+    return np.asarray(found)
 
 
-def condition(
-    prior: Prior, moments: Moments, innovation: FloatArray, noise: FloatArray, judge: Judge
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """Condition on an innovation, with the noise that a judge leaves.
-
-    Parameters
-    ----------
-    prior : Prior
-    moments : Moments
-    innovation : (m,) ndarray
-        η.
-    noise : (m,) ndarray
-        Diagonal of R.
-    judge : Judge
-
-    Returns
-    -------
-    s, P : (N,), (N, N) ndarray
-    variance : (m,) ndarray
-        S_ii before inflation.
-    inflation : (m,) ndarray
-        φ.
-    nis : float
-        ηᵀ(S + φR)⁻¹η.
+def factor(own: FloatArray, diagonal: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of an innovation's covariance, with another diagonal in its place.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If S is not positive definite.
-
-    Notes
-    -----
-    With S = L Lᵀ and X = C L⁻ᵀ: K η = X (L⁻¹η) and P - K S Kᵀ = P - X Xᵀ, a symmetric product.
+        If it is not positive definite.
     """
-    m = len(innovation)
-    diagonal = np.diag_indices(m)
-    own = moments.own
-    variance = np.diagonal(own) + noise
     S = own.copy(order="F")
-    S[diagonal] = variance
-    chol_S = _factor(S)
-    white, _ = lapack.dtrtrs(chol_S, innovation, lower=1)
-    nis = float(white @ white)
-    inflation = judge(Suspicion(innovation, variance, noise, chol_S, nis))
-    if inflation.any():
-        S = own.copy(order="F")
-        S[diagonal] = variance + inflation * noise
-        chol_S = _factor(S)
-        white, _ = lapack.dtrtrs(chol_S, innovation, lower=1)
-        nis = float(white @ white)
-    X = blas.dtrsm(1.0, chol_S, moments.cross, side=1, lower=1, trans_a=1)
-    return (
-        prior.s + X @ white,
-        _less(prior.P, X),
-        variance,
-        inflation,
-        nis,
-    )
-
-
-def _factor(S: FloatArray) -> FloatArray:
-    """Lower Cholesky factor, in the place of S."""
-    factor, failed = lapack.dpotrf(S, lower=1, clean=0, overwrite_a=1)
+    S.reshape(-1, order="A")[:: len(S) + 1] = diagonal
+    found, failed = lapack.dpotrf(S, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the innovation's covariance is not positive definite")
-    return np.asarray(factor)
+    return np.asarray(found)
 
 
-def _less(P: FloatArray, X: FloatArray) -> FloatArray:
-    """P - X Xᵀ, exactly symmetric."""
-    # P is symmetric, so that its transpose is itself in the order that BLAS reads.
-    lower = blas.dsyrk(-1.0, X, beta=1.0, c=P.T, lower=1)
-    return symmetric(lower)
+def solve(chol: FloatArray, right: FloatArray) -> FloatArray:
+    """L⁻¹ times one or many vectors, for a lower triangular L."""
+    found, _ = lapack.dtrtrs(chol, right, lower=1)
+    return np.asarray(found)
 
 
 def symmetric(lower: FloatArray) -> FloatArray:
     """The symmetric matrix of a lower triangle."""
-    out = np.tril(lower)
-    out += np.tril(lower, -1).T
+    out = lower.copy(order="C")
+    np.copyto(out, lower.T, where=_above(len(lower)))
     return out
+
+
+@cache
+def _above(n: int) -> BoolArray:
+    """Where a matrix of n rows is above its diagonal."""
+    return np.triu(np.ones((n, n), dtype=np.bool_), 1)

@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.estimation import robust
-from pse_analysis.estimation.conditioning import Moments, Prior, condition
+from pse_analysis.estimation.conditioning import Posterior, Predicted, Prior
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.holt import Process
 from pse_analysis.estimation.noise import Learnt, Noise
 from pse_analysis.estimation.robust import Judge, Protection
+from pse_analysis.estimation.square_root import carried
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout, wrap
@@ -29,8 +30,8 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 
-Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Moments]
-"""(prior, snapshot, rows, tuned, s) -> moments of the rows, linearised at s where it matters."""
+Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Predicted]
+"""(prior, snapshot, rows, tuned, s) -> prediction of the rows, linearised at s where it matters."""
 
 
 class Observation(NamedTuple):
@@ -83,6 +84,8 @@ class GaussianState:
         Memory of the observation.
     refusals : (m,) ndarray of int
         Consecutive refusals of each channel.
+    chol_P : (N, N) ndarray, optional
+        Root of P, where it is carried beside it.
     """
 
     s: FloatArray
@@ -92,15 +95,12 @@ class GaussianState:
     noise: Any
     tuned: float
     refusals: IntArray
+    chol_P: FloatArray | None = None
 
 
 class _Update(NamedTuple):
-    s: FloatArray
-    P: FloatArray
+    found: Posterior
     innovation: FloatArray
-    variance: FloatArray
-    inflation: FloatArray
-    nis: float
     tuned: float
     iterations: int
     converged: bool
@@ -164,17 +164,20 @@ class GaussianFilter:
         s = s + drift
         x = state.x.copy()
         x[columns] = s[: len(columns)]
-        prior = Prior(s, forecast + covariance, x, columns)
+        root = state.chol_P
+        if root is not None:
+            root = carried(_through(self.process.transition, root), covariance)
+        prior = Prior(s, forecast + covariance, x, columns, root)
         used = snapshot.available & snapshot.fresh
         if not used.any():
-            return replace(state, s=s, P=prior.P, x=x, process=process), Info.nothing(
+            return replace(state, s=s, P=prior.P, x=x, process=process, chol_P=root), Info.nothing(
                 m, Status.PREDICTED
             )
         rows = np.flatnonzero(used)
         try:
             update = self._update(prior, snapshot, rows, state.tuned, self.robustness.judge)
             refusals = np.zeros(m, dtype=np.int64)
-            refusals[rows] = np.where(update.inflation > 0, state.refusals[rows] + 1, 0)
+            refusals[rows] = np.where(update.found.inflation > 0, state.refusals[rows] + 1, 0)
             status, detail = Status.OK, ""
             protection = self.robustness.protection
             if protection is not None and protection.latched(refusals, used):
@@ -188,24 +191,26 @@ class GaussianFilter:
         if not update.converged:
             status = Status.NOT_CONVERGED
             detail = f"still moving after {update.iterations} passes; more noise would slow it less"
-        learnt = Learnt(update.s - affine, update.s - s, update.P, forecast)
+        found = update.found
+        learnt = Learnt(found.s - affine, found.s - s, found.P, forecast)
         after = GaussianState(
-            update.s,
-            update.P,
-            prior.filled(update.s),
+            found.s,
+            found.P,
+            prior.filled(found.s),
             process,
             self.noise.learn(noise, learnt),
             update.tuned,
             refusals,
+            found.chol_P,
         )
         full = np.full((2, m), np.nan)
         inflation = np.zeros(m)
-        full[0, rows], full[1, rows] = update.innovation, np.sqrt(update.variance)
-        inflation[rows] = update.inflation
+        full[0, rows], full[1, rows] = update.innovation, np.sqrt(found.variance)
+        inflation[rows] = found.inflation
         return after, Info(
             status,
             update.iterations,
-            update.nis,
+            found.nis,
             len(rows),
             used,
             full[0],
@@ -221,27 +226,18 @@ class GaussianFilter:
         angular = self.model.angular[rows]
         at = prior.s
         converged = False
+        verdict = None if judge is robust.none else judge
         for passes in range(1, self.observation.passes + 1):  # noqa: B007 (reported below)
-            moments = self.observation.predict(prior, snapshot, rows, tuned, at)
-            eta = snapshot.z[rows] - moments.mean
+            predicted = self.observation.predict(prior, snapshot, rows, tuned, at)
+            eta = snapshot.z[rows] - predicted.mean
             eta[angular] = wrap(eta[angular])
-            s, P, variance, inflation, nis = condition(prior, moments, eta, R, judge)
-            moved = np.abs(s - at).max()
-            at, tuned = s, moments.tuned
+            found = predicted.condition(prior, eta, R, verdict)
+            moved = np.abs(found.s - at).max()
+            at, tuned = found.s, predicted.tuned
             if moved < TOLERANCE:
                 converged = True
                 break
-        return _Update(
-            s,
-            P,
-            eta,
-            variance,
-            inflation,
-            nis,
-            tuned,
-            passes,
-            converged or self.observation.passes == 1,
-        )
+        return _Update(found, eta, tuned, passes, converged or self.observation.passes == 1)
 
     def _unlatch(
         self,
@@ -263,8 +259,10 @@ class GaussianFilter:
         P = prior.P.copy()
         voltages = np.arange(prior.n)
         P[voltages, voltages] += protection.widening(refusals[rows])
-        widened = self._update(replace(prior, P=P), snapshot, rows, tuned, robust.per_channel)
-        if 2 * np.count_nonzero(widened.inflation) > np.count_nonzero(update.inflation):
+        widened = self._update(
+            replace(prior, P=P, carried=None), snapshot, rows, tuned, robust.per_channel
+        )
+        if 2 * np.count_nonzero(widened.found.inflation) > np.count_nonzero(update.found.inflation):
             return update, refusals, Status.OK, f"{cause}: a wider forecast does not clear them"
         # A judge that refuses whole snapshots is not given another `patience` of them to lose.
         again = np.zeros_like(refusals)
@@ -272,6 +270,14 @@ class GaussianFilter:
             again[rows] = patience - 1
         detail = f"{cause}: the forecast was widened, which cleared most of them"
         return widened, again, Status.RESTARTED, detail
+
+
+def _through(transition: FloatArray, root: FloatArray) -> FloatArray:
+    """F L, with F = transition ⊗ I."""
+    if transition.size == 1:
+        return float(transition[0, 0]) * root
+    blocks = root.reshape(len(transition), -1, root.shape[1])
+    return np.asarray(np.einsum("ij,jnk->ink", transition, blocks).reshape(root.shape))
 
 
 def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianFilter) -> Estimator:

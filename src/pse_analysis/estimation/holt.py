@@ -47,12 +47,15 @@ class Process(NamedTuple):
     forecast : (s, P, memory) -> (F s + g, F P Fᵀ, memory)
     noise : Q -> covariance of w
         From the covariance Q of the voltages' own noise, (n, n).
+    transition : (order, order) ndarray
+        F = transition ⊗ I.
     """
 
     order: int
     begin: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, Any]]
     forecast: Callable[[FloatArray, FloatArray, Any], tuple[FloatArray, FloatArray, Any]]
     noise: Callable[[FloatArray], FloatArray]
+    transition: FloatArray
 
 
 def random_walk() -> Process:
@@ -62,6 +65,7 @@ def random_walk() -> Process:
         lambda x, covariance, _noise: (x, covariance, None),
         lambda s, covariance, _memory: (s, covariance, None),
         lambda noise: noise,
+        np.ones((1, 1)),
     )
 
 
@@ -103,7 +107,7 @@ def holt(params: HoltParams | None = None) -> Process:
         ahead = level + slope
         return ahead, factor**2 * covariance, _Smoothing(ahead, level, slope)
 
-    return Process(1, begin, forecast, lambda noise: noise)
+    return Process(1, begin, forecast, lambda noise: noise, np.full((1, 1), factor))
 
 
 def local_trend(params: HoltParams | None = None) -> Process:
@@ -156,6 +160,7 @@ def local_trend(params: HoltParams | None = None) -> Process:
         begin,
         forecast,
         lambda noise: _block_diagonal(noise, noise * (alpha * beta**2 / margin)),
+        np.array([[1.0, 1.0], [0.0, 1.0]]),
     )
 
 

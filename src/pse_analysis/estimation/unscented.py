@@ -8,16 +8,24 @@ unscented transform become
     S = R + (D Dᵀ + E Eᵀ)/s + (β - α²) ē ēᵀ
     C = L Dᵀ/√s
 
-which are the same numbers without the cancellation of large weights: S is positive definite as long
-as α² ≤ β, and P - C S⁻¹ Cᵀ = L (I - Dᵀ S⁻¹ D/s) Lᵀ always. Rows that are linear in x have no e.
-Slopes behind x do not enter h, so that the points need not spread along them.
+which are the same numbers without the cancellation of large weights. Rows that are linear in x have
+no e, and a multiple of ē added to every e_i makes one product of the last two terms of S:
+
+    E Eᵀ/s + (β - α²) ē ēᵀ = E' E'ᵀ/s,  E' = E + k ē 1ᵀ,  k (2 + k n/s) = β - α²,
+
+which has a real k for every scaling, so that S is never diminished. Slopes behind x do not enter h,
+and the points need not spread along them.
+
+The step is conditioned in one of two forms, which agree to rounding. ``covariance`` carries P,
+takes a symmetric product from it, and repairs a P that rounding left indefinite; ``square_root``
+carries a root of P by orthogonal triangularisation and takes nothing from anything.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,21 +33,22 @@ from scipy import optimize
 from scipy.linalg import blas, lapack
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.conditioning import Moments, Prior, cholesky
+from pse_analysis.estimation.conditioning import Moments, Predicted, Prior
 from pse_analysis.estimation.estimator import Snapshot
 from pse_analysis.estimation.gaussian import Observation
-from pse_analysis.measurement import BUS, FROM, IA, TO, VA, VM, MeasurementModel, P, Q, wrap
+from pse_analysis.estimation.sigma_points import SigmaPoints, Spread
+from pse_analysis.estimation.square_root import Halves
+from pse_analysis.measurement import BUS, FROM, TO, MeasurementModel, P, Q, wrap
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
+Form = Literal["covariance", "square_root"]
 
 ALPHA_RANGE = (0.02, 1.0)
 """Where adaptive scaling looks for α."""
 ALPHA_TOLERANCE = 1e-3
 MAX_TRIALS = 8
-SLAB = 64
-"""Directions whose points are evaluated at once: what h needs for them stays in the cache."""
 
 
 @dataclass(frozen=True)
@@ -67,114 +76,46 @@ class Scaling:
             )
 
 
-class Spread(NamedTuple):
-    """h around a mean.
-
-    Attributes
-    ----------
-    square : float
-        s.
-    centre : (m,) ndarray
-        γ₀.
-    odd : (m, n) ndarray
-        d_i in its columns.
-    curved : (k,) ndarray of int
-        Rows that are not linear in x.
-    even, shift : (k, n), (k,) ndarray
-        e_i in its columns, and ē, of the curved rows.
-    """
-
-    square: float
-    centre: FloatArray
-    odd: FloatArray
-    curved: IntArray
-    even: FloatArray
-    shift: FloatArray
-
-    @property
-    def mean(self) -> FloatArray:
-        """ŷ. (m,)"""
-        out = self.centre.copy()
-        out[self.curved] += self.shift
-        return out
+def _bent(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> FloatArray:
+    """E' of the curved rows. (k, n)"""
+    ratio = spread.square / prior.n
+    move = (np.sqrt(1.0 + (scaling.beta - alpha**2) / ratio) - 1.0) * ratio
+    return np.asarray(spread.even + move * spread.shift[:, None])
 
 
-class SigmaPoints:
-    """h at all sigma points of a state at once.
-
-    Parameters
-    ----------
-    model : MeasurementModel
-        Its columns are the voltages that are estimated.
-    """
-
-    def __init__(self, model: MeasurementModel) -> None:
-        self.model = model
-        quantity = model.layout.quantity
-        self._curved = ~np.isin(quantity, (VM, VA))
-        self._folded = quantity == IA
-
-    def spread(self, prior: Prior, chol_P: FloatArray, square: float, rows: IntArray) -> Spread:
-        """Odd and even parts of h along the columns of √s L, for some rows of the layout."""
-        n, m = prior.n, len(rows)
-        whole = m == self.model.shape[0]
-        curved, folded = np.flatnonzero(self._curved[rows]), self._folded[rows]
-        centre = self.model.h(prior.x)[rows]
-        odd, even = np.empty((m, n)), np.empty((len(curved), n))
-        columns, run = _run(prior.columns), _run(curved)
-        for first in range(0, n, SLAB):
-            part = slice(first, min(first + SLAB, n))
-            step = np.sqrt(square) * chol_P[:n, part]
-            width = step.shape[1]
-            points = np.repeat(prior.x[:, None], 2 * width, axis=1)
-            points[columns, :width] += step
-            points[columns, width:] -= step
-            y = self.model.h(points)
-            if not whole:
-                y = y[rows]
-            if folded.any():
-                y[folded] = centre[folded, None] + wrap(y[folded] - centre[folded, None])
-            np.subtract(y[:, :width], y[:, width:], out=odd[:, part])
-            # The even part of a linear row is nothing, and neither is it worth its square.
-            np.add(y[run, :width], y[run, width:], out=even[:, part])
-        odd *= 0.5
-        even *= 0.5
-        even -= centre[run, None]
-        return Spread(square, centre, odd, curved, even, even.sum(axis=1) / square)
-
-    def moments(
-        self,
-        prior: Prior,
-        chol_P: FloatArray,
-        spread: Spread,
-        rows: IntArray,
-        central: float,
-        tuned: float,
-    ) -> Moments:
-        """Moments of the rows; ``central`` is the weight β - α² of ē ēᵀ."""
-        n, square, run = prior.n, spread.square, _run(spread.curved)
-        # Fortran order is what BLAS reads without a copy; odd.T has it.
-        own = blas.dsyrk(1.0 / square, spread.odd.T, trans=1, lower=1)
-        if len(spread.shift):
-            # A symmetric matrix is its own transpose, in the order that BLAS reads.
-            bent = blas.dsyrk(
-                1.0 / square,
-                spread.even.T,
-                trans=1,
-                lower=1,
-                beta=1.0,
-                c=np.outer(central * spread.shift, spread.shift).T,
-                overwrite_c=1,
-            )
-            own[(run, run) if isinstance(run, slice) else np.ix_(run, run)] += bent
-        root = 1.0 / np.sqrt(square)
-        cross = blas.dtrmm(root, chol_P[:n, :n], spread.odd.T, lower=1)
-        if len(chol_P) > n:
-            cross = np.asfortranarray(np.vstack([cross, root * (chol_P[n:, :n] @ spread.odd.T)]))
-        return Moments(spread.mean, own, cross, tuned)
+def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Moments:
+    """The prediction as a mean and covariances, under the α that the spread was made with."""
+    n, inverse = prior.n, 1.0 / spread.square
+    # Fortran order is what BLAS reads without a copy; odd.T has it.
+    own = blas.dsyrk(inverse, spread.odd.T, trans=1, lower=1)
+    if len(spread.curved):
+        bent = _bent(prior, spread, scaling, alpha)
+        inside = _run(spread.curved)
+        own[inside] += blas.dsyrk(inverse, bent.T, trans=1, lower=1)
+    root, chol_P = np.sqrt(inverse), prior.chol_P
+    if len(chol_P) == n:
+        cross = blas.dtrmm(root, chol_P, spread.odd.T, lower=1)
+    else:
+        cross = blas.dgemm(root, chol_P[:, :n], spread.odd.T)
+    return Moments(spread.mean, own, cross, alpha)
 
 
-def fixed(model: MeasurementModel, scaling: Scaling | None = None) -> Observation:
+def halves(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Halves:
+    """The prediction as a mean and weighted deviations."""
+    root = np.sqrt(1.0 / spread.square)
+    bent = root * _bent(prior, spread, scaling, alpha)
+    return Halves(spread.mean, root * spread.odd, spread.curved, bent, alpha)
+
+
+_FORMS: dict[Form, Callable[[Prior, Spread, Scaling, float], Predicted]] = {
+    "covariance": moments,
+    "square_root": halves,
+}
+
+
+def fixed(
+    model: MeasurementModel, scaling: Scaling | None = None, form: Form = "covariance"
+) -> Observation:
     """Unscented prediction with a constant α.
 
     Notes
@@ -186,16 +127,16 @@ def fixed(model: MeasurementModel, scaling: Scaling | None = None) -> Observatio
 
     def predict(
         prior: Prior, _snapshot: Snapshot, rows: IntArray, _tuned: float, _at: FloatArray
-    ) -> Moments:
-        chol_P = cholesky(prior.P)
-        spread = points.spread(prior, chol_P, _square(scaling, scaling.alpha, prior.n), rows)
-        central = scaling.beta - scaling.alpha**2
-        return points.moments(prior, chol_P, spread, rows, central, scaling.alpha)
+    ) -> Predicted:
+        spread = points.spread(prior, _square(scaling, scaling.alpha, prior.n), rows)
+        return _FORMS[form](prior, spread, scaling, scaling.alpha)
 
     return Observation(predict, scaling.alpha)
 
 
-def by_moments(model: MeasurementModel, scaling: Scaling | None = None) -> Observation:
+def by_moments(
+    model: MeasurementModel, scaling: Scaling | None = None, form: Form = "covariance"
+) -> Observation:
     """Unscented prediction with the α whose mean is nearest to the true one.
 
     Parameters
@@ -221,23 +162,23 @@ def by_moments(model: MeasurementModel, scaling: Scaling | None = None) -> Obser
 
     def predict(
         prior: Prior, snapshot: Snapshot, rows: IntArray, tuned: float, _at: FloatArray
-    ) -> Moments:
-        chol_P = cholesky(prior.P)
+    ) -> Predicted:
         target, which = power.mean(prior, rows)
         sigma = snapshot.sigma[rows[which]]
 
         def error(alpha: float) -> tuple[FloatArray, Spread]:
-            spread = points.spread(prior, chol_P, _square(scaling, alpha, prior.n), rows)
+            spread = points.spread(prior, _square(scaling, alpha, prior.n), rows)
             return (spread.mean[which] - target) / sigma, spread
 
         alpha, spread = _least(error, tuned)
-        central = scaling.beta - alpha**2
-        return points.moments(prior, chol_P, spread, rows, central, alpha)
+        return _FORMS[form](prior, spread, scaling, alpha)
 
     return Observation(predict, scaling.alpha)
 
 
-def by_likelihood(model: MeasurementModel, scaling: Scaling | None = None) -> Observation:
+def by_likelihood(
+    model: MeasurementModel, scaling: Scaling | None = None, form: Form = "covariance"
+) -> Observation:
     """Unscented prediction with the α under which the innovation is most likely.
 
     It looks at the measurements that it then uses, so that P is a little too small.
@@ -247,18 +188,14 @@ def by_likelihood(model: MeasurementModel, scaling: Scaling | None = None) -> Ob
 
     def predict(
         prior: Prior, snapshot: Snapshot, rows: IntArray, _tuned: float, _at: FloatArray
-    ) -> Moments:
-        chol_P = cholesky(prior.P)
+    ) -> Predicted:
         noise = np.diag(snapshot.sigma[rows] ** 2)
 
-        def moments(alpha: float) -> Moments:
-            spread = points.spread(prior, chol_P, _square(scaling, alpha, prior.n), rows)
-            return points.moments(
-                prior, chol_P, spread, rows, scaling.beta - alpha**2, float(alpha)
-            )
+        def spread(alpha: float) -> Spread:
+            return points.spread(prior, _square(scaling, alpha, prior.n), rows)
 
         def cost(alpha: float) -> float:
-            found = moments(alpha)
+            found = moments(prior, spread(alpha), scaling, alpha)
             factor, failed = lapack.dpotrf(found.own + noise, lower=1)
             if failed:
                 return float(np.finfo(float).max)
@@ -270,16 +207,18 @@ def by_likelihood(model: MeasurementModel, scaling: Scaling | None = None) -> Ob
         best = optimize.minimize_scalar(
             cost, bounds=ALPHA_RANGE, method="bounded", options={"xatol": ALPHA_TOLERANCE}
         )
-        return moments(float(best.x))
+        alpha = float(best.x)
+        return _FORMS[form](prior, spread(alpha), scaling, alpha)
 
     return Observation(predict, scaling.alpha)
 
 
-def _run(rows: IntArray) -> slice | IntArray:
-    """Rows as a slice where they follow each other, which spares a copy."""
-    if len(rows) and rows[-1] - rows[0] + 1 == len(rows):
-        return slice(int(rows[0]), int(rows[-1]) + 1)
-    return rows
+def _run(rows: IntArray) -> tuple[slice, slice] | tuple[IntArray, IntArray]:
+    """Index of a square block; slices, which spare a copy, where its rows follow each other."""
+    if rows[-1] - rows[0] + 1 == len(rows):
+        run = slice(int(rows[0]), int(rows[-1]) + 1)
+        return run, run
+    return rows[:, None], rows[None, :]
 
 
 def _square(scaling: Scaling, alpha: float, n: int) -> float:
