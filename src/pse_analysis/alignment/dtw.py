@@ -5,41 +5,37 @@ in series with it, whose stamps are exact: the delay of each sample is where the
 
 A window of the device's current and of its partner's, both z-scored, is matched by dynamic time
 warping inside a causal band, eqs. (1)–(2) of [qi2025] with the absolute difference that eq. (1)
-misprints as a root. The match of a single noisy sample is worth little where the current hardly
-moves. So it is weighed against two other things that the same data tell: the likelihood of every
-delay in the band, given how far the two currents usually differ, and the usual delay of the device
-with its spread. The spread that is left, relative to that of a delay about which nothing is known,
-is the confidence; where there is next to none the device's usual delay, the lag of the largest
+misprints as a root. The path of least cost follows every wiggle of the noise; it is better with a
+price on leaving the diagonal, but it still cannot tell where it is right. So it is weighed against
+the posterior of the delays (`pse_analysis.alignment.delays`), by how far the two have been apart.
+The spread of that posterior, relative to that of a delay about which nothing is known, is the
+confidence; where there is too little of it the device's usual delay, the lag of the largest
 cross-correlation, stands instead.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from dtaidistance import dtw
+from dtaidistance import dtw_cc
+from dtaidistance.dtw import DTWSettings
 
+from pse_analysis.alignment import delays, lag
+from pse_analysis.alignment.lag import Band, Reference
 from pse_analysis.errors import ParameterError
+
+__all__ = ["METHODS", "Match", "Method", "Reference", "Stamps", "TimeParams", "recover"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FEWEST_SAMPLES = 6
-"""Samples that a window must hold for a match, and for a line between two currents."""
-LAST = 2
-"""Samples that say how far the loads between two places have moved their currents apart."""
-FEWEST_FOR_LAG = 20
-"""Increments below which a cross-correlation says nothing."""
-SPREADS = (0.02, 0.1, 0.2, 0.4, 2.0)
-"""Spreads of a device's delay that are weighed against each other, relative to the band."""
-EXCESS = (1.0, 1.5, 2.2, 3.3, 5.0, 10.0)
-"""Differences between two currents that are weighed, in multiples of the meter's own noise."""
-EVIDENCE = 3.0
-"""Log-likelihood by which a narrower spread must beat a wider one: ignorance is not constancy."""
+"""Samples that a window must hold for a match."""
+LAGS = 24
+"""Steps into which the band is divided at least: a finer phasor current is averaged."""
 
 Method = Literal["none", "xcorr", "dtw"]
 METHODS: tuple[Method, ...] = ("none", "xcorr", "dtw")
@@ -59,7 +55,9 @@ class TimeParams:
     largest_delay_s : float
         Largest credible delay: the width of the causal band. [s]
     lag_window_s : float
-        Past from which a device's usual delay and its spread are learnt. [s]
+        Past from which a device's usual delay and its habits are learnt. [s]
+    warp_penalty : float
+        Cost of a step of the path off the diagonal, in σ of the window; 0 in [qi2025].
     least_confidence : float
         Confidence below which the usual delay stands instead of the match.
     least_correlation : float
@@ -71,7 +69,8 @@ class TimeParams:
     window_s: float = 2700.0
     largest_delay_s: float = 120.0
     lag_window_s: float = 86400.0
-    least_confidence: float = 0.05
+    warp_penalty: float = 1.0
+    least_confidence: float = 1.0 / 3.0
     least_correlation: float = 0.2
 
     def __post_init__(self) -> None:
@@ -80,43 +79,15 @@ class TimeParams:
                 raise ParameterError(
                     f"[align] {name} must be positive, received {getattr(self, name)}"
                 )
+        if self.warp_penalty < 0:
+            raise ParameterError(
+                f"[align] warp_penalty must not be negative, received {self.warp_penalty}"
+            )
         if self.window_s < 2 * self.largest_delay_s:
             raise ParameterError(
                 f"[align] window_s = {self.window_s:g} holds no match: expected at least twice "
                 f"largest_delay_s = {self.largest_delay_s:g}"
             )
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """Current of a phasor unit on an even grid of exact times.
-
-    Attributes
-    ----------
-    time : (n,) ndarray
-        Even. [s]
-    known : (n,) ndarray
-        When the value had arrived. [s]
-    value : (n,) ndarray
-    """
-
-    time: FloatArray
-    known: FloatArray
-    value: FloatArray
-
-    @classmethod
-    def of(cls, time: FloatArray, arrival: FloatArray, value: FloatArray) -> Reference:
-        """Even grid at the usual period, holding the last value where one is missing."""
-        step = float(np.median(np.diff(time)))
-        even = np.arange(time[0], time[-1] + 0.5 * step, step)
-        last = np.searchsorted(time, even + 1e-6, side="right") - 1
-        known = np.maximum.accumulate(np.maximum(arrival[last], even))
-        return cls(even, known, value[last])
-
-    @property
-    def step(self) -> float:
-        """Of the grid. [s]"""
-        return float(self.time[1] - self.time[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +155,8 @@ def match_window(
     Each sample stands for the time around its arrival. The reference is delayed by half the largest
     delay, so that the symmetric Sakoe–Chiba band of that radius allows delays from zero to the
     largest one. The grid reaches half the band beyond the last known value; what stands there
-    belongs to no sample.
+    belongs to no sample. A single value that neither of its neighbours shares is a spike, and the
+    median of the three stands for it.
     """
     step = reference.step
     radius = max(1, round(0.5 * params.largest_delay_s / step))
@@ -193,9 +165,9 @@ def match_window(
     seen = reference.time[first : last + 1]
     grid = seen + radius * step
     owner = np.searchsorted(0.5 * (arrival[1:] + arrival[:-1]), grid)
-    device, other = _z_score(value[owner]), _z_score(reference.value[first : last + 1])
-    pairs = dtw.warping_path_fast(device, other, window=radius + 1, inner_dist="euclidean")
-    path = np.fromiter(chain.from_iterable(pairs), np.int64, 2 * len(pairs)).reshape(-1, 2)
+    device = _z_score(_without_spikes(value)[owner])
+    other = _z_score(reference.value[first : last + 1])
+    path = _path(device, other, radius, params.warp_penalty)
     time = seen[path[:, 1]]
     whose = owner[path[:, 0]]
     delay = arrival[whose] - time
@@ -223,7 +195,7 @@ def recover(
     arrival : (n,) ndarray
         Increasing. [s]
     value, sigma : (n,) ndarray
-        Current magnitude and σ of its noise, in any one unit.
+        Current magnitude, NaN where it is missing, and σ of its noise, in any one unit.
     reference : Reference
         Current of the partner.
     instants : (T,) ndarray
@@ -241,16 +213,36 @@ def recover(
     """
     n = len(arrival)
     stamps = Stamps(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int8))
-    if method == "none" or n < FEWEST_FOR_LAG or len(reference.time) < FEWEST_FOR_LAG:
+    known = np.isfinite(value)
+    enough = min(known.sum(), len(reference.time)) >= lag.FEWEST
+    if method == "none" or not enough:
         return stamps
-    lags = np.arange(0.0, params.largest_delay_s + 0.5 * reference.step, reference.step)
-    band = _band(arrival, reference, lags)
-    usual, found = _usual_delay(arrival, value, band, lags, params.lag_window_s)
-    believed = found >= params.least_correlation
+    reference = reference.thinned(params.largest_delay_s / LAGS)
+    band = Band.of(arrival, reference, params.largest_delay_s)
+    usual, found = lag.usual_delay(
+        arrival[known], value[known], band.rows(known), params.lag_window_s
+    )
+    # A sample without a current has the usual delay that was known before it.
+    before = np.maximum(np.cumsum(known) - 1, 0)
+    usual, found = usual[before], found[before]
+    believed = (found >= params.least_correlation) & (np.cumsum(known) > 0)
     stamps.delay[believed] = usual[believed]
     stamps.method[believed] = XCORR
-    if method == "dtw":
-        _match_all(arrival, value, sigma, reference, instants, params, lags, band, usual, stamps)
+    if method == "xcorr":
+        return stamps
+    mean, spread = delays.follow(
+        arrival, value, sigma, reference, band, usual, believed, instants, params.lag_window_s
+    )
+    path = _paths(arrival, value, reference, instants, params)
+    apart = _apart(path - mean, np.searchsorted(arrival, instants, side="right"))
+    share = np.where(np.isfinite(path) & (apart > 0), spread**2 / (spread**2 + apart**2), 0.0)
+    mean = mean + np.where(share > 0, share * (path - mean), 0.0)
+    ignorant = params.largest_delay_s / np.sqrt(12.0)
+    confidence = np.clip(1.0 - np.hypot(spread, 0.3 * reference.step) / ignorant, 0.0, 1.0)
+    stamps.confidence[:] = np.where(believed & np.isfinite(mean), confidence, 0.0)
+    sure = (stamps.confidence >= params.least_confidence) & (stamps.confidence > 0)
+    stamps.delay[sure] = mean[sure]
+    stamps.method[sure] = DTW
     return stamps
 
 
@@ -258,154 +250,64 @@ def correlation(
     arrival: FloatArray, value: FloatArray, reference: Reference, params: TimeParams
 ) -> float:
     """Largest cross-correlation of all increments of a device with a reference; -1 without any."""
-    if len(arrival) <= FEWEST_FOR_LAG:
+    known = np.isfinite(value)
+    if known.sum() <= lag.FEWEST:
         return -1.0
-    lags = np.arange(0.0, params.largest_delay_s + 0.5 * reference.step, reference.step)
-    band = _band(arrival, reference, lags)
-    return float(_usual_delay(arrival, value, band, lags, np.inf)[1][-1])
+    reference = reference.thinned(params.largest_delay_s / LAGS)
+    band = Band.of(arrival[known], reference, params.largest_delay_s)
+    return float(lag.usual_delay(arrival[known], value[known], band, np.inf)[1][-1])
 
 
-def _band(arrival: FloatArray, reference: Reference, lags: FloatArray) -> FloatArray:
-    """Reference at every credible sampling time, as known at arrival. (n, n_lag)"""
-    last = np.searchsorted(reference.known, arrival, side="right") - 1
-    newest = reference.time[np.maximum(last, 0)]
-    at = np.minimum(arrival[:, None] - lags, newest[:, None])
-    return np.asarray(np.interp(at.ravel(), reference.time, reference.value).reshape(at.shape))
-
-
-def _usual_delay(
-    arrival: FloatArray, value: FloatArray, band: FloatArray, lags: FloatArray, window_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """Lag of the largest cross-correlation of the increments so far, and that correlation. (n,)
-
-    Increments, because the levels of all loads share a daily curve that fits at any lag.
-    """
-    own, other = np.diff(value)[:, None], np.diff(band, axis=0)
-    # A load step is worth as much as a hundred quiet minutes, a meter's spike should not be.
-    scale = 1.4826 * np.median(np.abs(own)) + 1e-12
-    own = np.clip(own, -6 * scale, 6 * scale)
-    begin = np.searchsorted(arrival[1:], arrival[1:] - window_s)
-    row = np.arange(1, len(arrival))
-
-    def past(product: FloatArray) -> FloatArray:
-        total = np.concatenate([np.zeros((1, product.shape[1])), np.cumsum(product, axis=0)])
-        return np.asarray(total[row] - total[begin])
-
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = past(own * other) / np.sqrt(past(own**2) * past(other**2))
-    enough = (row - begin) >= FEWEST_FOR_LAG
-    correlation = np.where(enough[:, None] & np.isfinite(correlation), correlation, -1.0)
-    best = correlation.argmax(axis=1)
-    # The peak of a parabola through the best lag and its neighbours.
-    middle = np.clip(best, 1, len(lags) - 2)
-    left, centre, right = (correlation[row - 1, middle + k] for k in (-1, 0, 1))
-    bend = left - 2 * centre + right
-    shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
-    usual = lags[middle] + np.clip(shift, -1.0, 1.0) * (lags[1] - lags[0])
-    found = correlation.max(axis=1)
-    return np.concatenate([[0.0], usual]), np.concatenate([[-1.0], found])
-
-
-def _match_all(
+def _paths(
     arrival: FloatArray,
     value: FloatArray,
-    sigma: FloatArray,
     reference: Reference,
     instants: FloatArray,
     params: TimeParams,
-    lags: FloatArray,
-    band: FloatArray,
-    usual: FloatArray,
-    stamps: Stamps,
-) -> None:
-    """Weigh the match of every sample, instant by instant, and write what it says into stamps."""
-    width = float(lags[-1])
-    ignorant = width / np.sqrt(12.0)
-    noise = float(np.median(sigma)) * np.array(EXCESS)
-    evidence = np.zeros((len(arrival), len(EXCESS), len(SPREADS)))
-    settled = np.interp(arrival - stamps.delay, reference.time, reference.value)
-    bounds = np.searchsorted(arrival, instants, side="right")
+) -> FloatArray:
+    """Delay at which each sample was matched, in the window that ends with the next instant."""
+    path = np.full(len(arrival), np.nan)
+    known = np.isfinite(value)
+    when, current, where = arrival[known], value[known], np.flatnonzero(known)
+    bounds = np.searchsorted(when, instants, side="right")
     for end, begin, stop in zip(instants[1:], bounds[:-1], bounds[1:], strict=True):
-        rows = np.arange(np.searchsorted(arrival, end - params.window_s), stop)
-        fresh = np.arange(begin, stop)
-        fresh = fresh[stamps.method[fresh] == XCORR]
-        if len(fresh) == 0 or len(rows) < FEWEST_SAMPLES or reference.known[0] > end:
+        first = int(np.searchsorted(when, end - params.window_s))
+        if begin == stop or stop - first < FEWEST_SAMPLES or reference.known[0] > end:
             continue
-        past = np.arange(np.searchsorted(arrival, end - params.lag_window_s), begin)
-        line = _line(value[past], settled[past])
-        if line is None:
-            continue
-        apart = value[fresh, None] - line[0] - line[1] * band[fresh]
-        likelihood = _likelihood(apart, noise)
-        prior = _priors(usual[fresh], lags, width)
-        joint = likelihood[:, :, None, :] * prior[:, None, :, :]
-        evidence[fresh] = np.log(joint.sum(axis=3))
-        excess, spread = _widest(evidence[past[0] : stop].sum(axis=0))
-        posterior = joint[:, excess, spread]
-        mean, left = _moments(posterior, lags)
-        confidence = np.clip(1.0 - np.hypot(left, 0.3 * reference.step) / ignorant, 0.0, 1.0)
-        # The path knows the neighbours and their order; it is as sure as the sample itself.
-        blur = np.hypot(_moments(likelihood[:, excess], lags)[1], reference.step)
-        match = match_window(arrival[rows], value[rows], reference, float(end), params)
-        path = arrival[fresh] - match.matched[fresh - rows[0]]
-        known = np.isfinite(path)
-        away = (lags - np.where(known, path, 0.0)[:, None]) / blur[:, None]
-        pull = np.where(known[:, None], np.exp(-0.5 * away**2), 1.0)
-        mean, _ = _moments(posterior * pull, lags)
-        sure = confidence >= params.least_confidence
-        stamps.confidence[fresh] = confidence
-        stamps.delay[fresh[sure]] = mean[sure]
-        stamps.method[fresh[sure]] = DTW
-        settled[fresh] = np.interp(
-            arrival[fresh] - stamps.delay[fresh], reference.time, reference.value
-        )
+        rows = slice(first, stop)
+        match = match_window(when[rows], current[rows], reference, float(end), params)
+        path[where[begin:stop]] = (when[rows] - match.matched)[begin - first :]
+    return path
 
 
-def _line(value: FloatArray, settled: FloatArray) -> tuple[float, float] | None:
-    """Offset and slope of a device's current in its partner's; None where they do not agree.
-
-    The slope is that of the increments so far. The offset is that of the last few samples, because
-    the loads between the two places move it.
-    """
-    if len(value) < FEWEST_FOR_LAG:
-        return None
-    own, other = np.diff(value), np.diff(settled)
-    moved = float(other @ other)
-    slope = float(own @ other) / moved if moved > 0 else 0.0
-    if slope <= 0:
-        return None
-    return float(np.median((value - slope * settled)[-LAST:])), slope
+def _apart(difference: FloatArray, bounds: IntArray) -> FloatArray:
+    """RMS of the differences that were known before each sample's window; 0 while too few."""
+    some = np.isfinite(difference)
+    square = np.concatenate([[0.0], np.cumsum(np.where(some, difference, 0.0) ** 2)])
+    count = np.concatenate([[0], np.cumsum(some)])
+    row = np.arange(len(difference))
+    edges = np.concatenate([[0], bounds])
+    begin = edges[np.searchsorted(bounds, row, side="right")]
+    mean = square[begin] / np.maximum(count[begin], 1)
+    return np.asarray(np.where(count[begin] >= lag.FEWEST, np.sqrt(mean), 0.0))
 
 
-def _likelihood(apart: FloatArray, noise: FloatArray) -> FloatArray:
-    """Likelihood (k, n_noise, n_lag) of differences (k, n_lag) by Student's law of 4 degrees.
-
-    Loads between the two places jump now and then, which a normal law would take for a delay.
-    """
-    square = (apart[:, None, :] / noise[:, None]) ** 2
-    return np.asarray((1.0 + 0.25 * square) ** -2.5 / noise[:, None])
-
-
-def _moments(weight: FloatArray, lags: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation of a delay under weights (k, n_lag)."""
-    share = weight / weight.sum(axis=1, keepdims=True)
-    mean = share @ lags
-    return mean, np.sqrt(np.maximum(share @ lags**2 - mean**2, 0.0))
+def _path(device: FloatArray, other: FloatArray, radius: int, penalty: float) -> IntArray:
+    """Path of least summed absolute difference plus penalties, inside a band. (k, 2)"""
+    # The library's own wrapper for paths drops the inner distance, and squares are its default.
+    settings = DTWSettings.for_dtw(
+        device, other, window=radius + 1, inner_dist="euclidean", penalty=penalty
+    )
+    pairs = dtw_cc.warping_path(device, other, False, **settings.c_kwargs())
+    return np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _priors(usual: FloatArray, lags: FloatArray, width: float) -> FloatArray:
-    """Laws of a delay about its usual value, (k, n_spread, n_lag)."""
-    spread = np.maximum(np.array(SPREADS) * width, 0.3 * (lags[1] - lags[0]))
-    away = (lags - usual[:, None])[:, None, :] / spread[None, :, None]
-    law = np.exp(-0.5 * np.minimum(away**2, 500.0))
-    return np.asarray(law / law.sum(axis=2, keepdims=True))
-
-
-def _widest(evidence: FloatArray) -> tuple[int, int]:
-    """Noise and spread of the best evidence, with the widest spread that none beats clearly."""
-    best = evidence.max(axis=0)
-    spread = int(np.flatnonzero(best >= best.max() - EVIDENCE)[-1])
-    return int(evidence[:, spread].argmax()), spread
+def _without_spikes(value: FloatArray) -> FloatArray:
+    """Running median of three, but for the two ends."""
+    if len(value) < 3:
+        return value
+    middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+    return np.concatenate([value[:1], middle, value[-1:]])
 
 
 def _z_score(series: FloatArray) -> FloatArray:

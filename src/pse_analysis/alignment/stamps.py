@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.alignment import dtw
-from pse_analysis.alignment.dtw import METHODS, Method, Reference, TimeParams
+from pse_analysis.alignment import dtw, lag
+from pse_analysis.alignment.dtw import METHODS, Method, TimeParams
+from pse_analysis.alignment.lag import Reference
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, IM, TO, P, Q, SensorLayout, standard_deviation
 from pse_analysis.vocabulary import usable
@@ -97,39 +98,38 @@ def sampling_times(
     )[0]
     value = validated["corrected"].to_numpy(dtype=float) * layout.scale[column]
     good = usable(validated["flag"].to_numpy()) & np.isfinite(value)
-    seconds = (instants - instants[0]) / MICROSECOND
+    base = int(instants[0])
+    seconds = (instants - base) / MICROSECOND
+    study_begins = (study_start - base) / MICROSECOND
     chosen: dict[int, list[int]] = {}
     for number in np.unique(trial):
         mine = trial == number
-        references = _references(layout, source, column, stamp, arrival, value, mine & good)
+        references = _references(
+            layout, source, column, (stamp - base) / MICROSECOND, (arrival - base) / MICROSECOND,
+            value, mine & good,
+        )  # fmt: skip
         for place in np.unique(device[column[mine & clockless]]):
             rows = np.flatnonzero(mine & clockless & (device[column] == place))
-            came, current, sigma = _current(layout, column, arrival, value, rows[good[rows]])
-            base = int(instants[0])
+            came, current, sigma = _current(layout, column, arrival, value, rows, good)
             when = (came - base) / MICROSECOND
             if place not in chosen:
                 spot = int(column[rows[0]])
                 chosen[place] = _ranked(
-                    network, layout, spot, references, when, current, params,
-                    (study_start - base) / MICROSECOND, base,
-                )  # fmt: skip
+                    network, layout, spot, references, when, current, params, study_begins
+                )
             out.confidence[rows] = 0.0
-            if not chosen[place] or not len(came):
+            if not chosen[place]:
                 continue
             name = layout.channel[int(column[rows[0]])].rsplit(":", 1)[0]
             partner = chosen[place][0]
             out.partner[name] = layout.channel[partner]
             if partner not in references:
                 continue
-            found = dtw.recover(
-                when, current, sigma, _shifted(references[partner], base), seconds, params, method
-            )
-            at = np.clip(np.searchsorted(came, arrival[rows], side="right") - 1, 0, None)
-            same = came[at] == arrival[rows]
-            # A sample whose other half was lost has no current: the device's last delay will do.
+            found = dtw.recover(when, current, sigma, references[partner], seconds, params, method)
+            at = np.searchsorted(came, arrival[rows])
             out.time[rows] = arrival[rows] - np.rint(found.delay[at] * MICROSECOND).astype(np.int64)
-            out.confidence[rows] = np.where(same, found.confidence[at], 0.0)
-            out.method[rows] = np.where(same, found.method[at], np.minimum(found.method[at], 1))
+            out.confidence[rows] = found.confidence[at]
+            out.method[rows] = found.method[at]
     return out
 
 
@@ -186,52 +186,53 @@ def _references(
     layout: SensorLayout,
     source: npt.NDArray[np.object_],
     column: IntArray,
-    stamp: IntArray,
-    arrival: IntArray,
+    stamp: FloatArray,
+    arrival: FloatArray,
     value: FloatArray,
     rows: npt.NDArray[np.bool_],
 ) -> dict[int, Reference]:
-    """Currents of the phasor units of one trial, by row of the layout; times in µs."""
+    """Currents of the phasor units of one trial, by row of the layout; times in s."""
     out = {}
     for place in np.flatnonzero((source == "pmu") & (layout.quantity == IM) & (layout.side != BUS)):
         own = np.flatnonzero(rows & (column == place))
         own = own[np.argsort(stamp[own], kind="stable")]
         own = own[np.append(True, np.diff(stamp[own]) > 0)] if len(own) else own
-        if len(own) >= dtw.FEWEST_FOR_LAG:
-            out[int(place)] = Reference.of(
-                stamp[own].astype(float), arrival[own].astype(float), value[own]
-            )
+        if len(own) >= lag.FEWEST:
+            out[int(place)] = Reference.of(stamp[own], arrival[own], value[own])
     return out
 
 
-def _shifted(reference: Reference, base: int) -> Reference:
-    """The reference in seconds since a base in µs."""
-    return Reference(
-        (reference.time - base) / MICROSECOND,
-        (reference.known - base) / MICROSECOND,
-        reference.value,
-    )
-
-
 def _current(
-    layout: SensorLayout, column: IntArray, arrival: IntArray, value: FloatArray, rows: IntArray
+    layout: SensorLayout,
+    column: IntArray,
+    arrival: IntArray,
+    value: FloatArray,
+    rows: IntArray,
+    good: npt.NDArray[np.bool_],
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Arrivals of a device, its current magnitude and σ: measured, or apparent power at 1 p.u."""
+    """Arrivals of a device, its current magnitude and σ: measured, or apparent power at 1 p.u.
+
+    The current is NaN where it, or a half of the power, is missing or bad.
+    """
     wide = pd.DataFrame(
-        {"at": arrival[rows], "kind": layout.quantity[column[rows]], "value": value[rows]}
-    ).pivot_table(index="at", columns="kind", values="value", aggfunc="first")
+        {
+            "at": arrival[rows],
+            "kind": layout.quantity[column[rows]],
+            "value": np.where(good[rows], value[rows], np.nan),
+        }
+    ).pivot_table(index="at", columns="kind", values="value", aggfunc="first", dropna=False)
     some = layout.sigma[column[rows[:1]]], layout.relative[column[rows[:1]]]
+    came = wide.index.to_numpy(np.int64)
     if IM in wide:
-        whole = wide[IM].dropna()
-        current = whole.to_numpy()
-        return whole.index.to_numpy(np.int64), current, standard_deviation(current, *some)
+        current = wide[IM].to_numpy()
+        return came, current, standard_deviation(current, *some)
     if P not in wide or Q not in wide:
-        return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    whole = wide[[P, Q]].dropna()
-    power = whole.to_numpy()
+        nothing = np.full(len(came), np.nan)
+        return came, nothing, nothing
+    power = wide[[P, Q]].to_numpy()
     size = np.maximum(np.hypot(*power.T), 1e-9)
     sigma = np.hypot(*(power * standard_deviation(power, *some)).T) / size
-    return whole.index.to_numpy(np.int64), size, np.maximum(sigma, 1e-9)
+    return came, size, np.maximum(sigma, 1e-9)
 
 
 def _ranked(
@@ -243,7 +244,6 @@ def _ranked(
     current: FloatArray,
     params: TimeParams,
     until: float,
-    base: int,
 ) -> list[int]:
     """Phasor currents in the order in which they suit a device.
 
@@ -254,14 +254,14 @@ def _ranked(
     if not references:
         return []
     past = when < until
-    past = past if past.sum() > dtw.FEWEST_FOR_LAG else np.ones(len(when), dtype=bool)
+    past = past if past.sum() > lag.FEWEST else np.ones(len(when), dtype=bool)
     feeding = _feeding(network)
     own = _far_end(network, layout, spot, feeding)
     rank = {}
     for place, reference in references.items():
         far = _far_end(network, layout, place, feeding)
         series = far in feeding[own] or own in feeding[far]
-        found = dtw.correlation(when[past], current[past], _shifted(reference, base), params)
+        found = dtw.correlation(when[past], current[past], reference, params)
         if series or found >= ALONE:
             rank[place] = (not series, -found)
     return sorted(rank, key=lambda place: rank[place])
