@@ -13,7 +13,7 @@ from simulated_case import PARAMS, STUDY, curves, feeder
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid import library, power_flow
-from pse_analysis.grid.network import BusKind
+from pse_analysis.grid import BusKind
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 from pse_analysis.simulation import scenario
 from pse_analysis.simulation.settings import (

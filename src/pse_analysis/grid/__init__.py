@@ -7,6 +7,7 @@ after it.
 from __future__ import annotations
 
 from pse_analysis.grid import library
-from pse_analysis.grid.network import Branches, Buses, BusKind, Network
+from pse_analysis.grid.elements import Branches, Buses, BusKind
+from pse_analysis.grid.network import Network
 
 __all__ = ["Branches", "BusKind", "Buses", "Network", "library"]

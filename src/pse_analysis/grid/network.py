@@ -13,12 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import enum
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,140 +22,18 @@ import pandas as pd
 from scipy import sparse
 
 from pse_analysis.errors import GridError
+from pse_analysis.grid.elements import (
+    OPTIONAL,
+    Branches,
+    Buses,
+    BusKind,
+    branch_names,
+    freeze,
+)
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
-Columns = TypeVar("Columns", "Buses", "Branches")
-
-
-class BusKind(enum.IntEnum):
-    """What power flow holds at a bus: P and Q, P and |V|, or |V| and θ."""
-
-    PQ = 1
-    PV = 2
-    SLACK = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Buses:
-    """Columns of the bus table, each of length n_bus and read-only.
-
-    Attributes
-    ----------
-    name
-        Names as the literature numbers them.
-    kind
-        Values of `BusKind`.
-    vn_kv
-        Rated line-to-line voltage. [kV]
-    p_load_mw, q_load_mvar
-        Nominal load. [MW, Mvar]
-    p_gen_mw
-        Nominal generation. [MW]
-    vm_set_pu
-        Voltage set-point of PV and slack buses. [p.u.]
-    q_min_mvar, q_max_mvar
-        Reactive limits of the generation; ±inf where none are known. [Mvar]
-    g_shunt_pu, b_shunt_pu
-        Shunt admittance. [p.u.]
-    """
-
-    name: tuple[str, ...]
-    kind: npt.NDArray[np.int8]
-    vn_kv: FloatArray
-    p_load_mw: FloatArray
-    q_load_mvar: FloatArray
-    p_gen_mw: FloatArray
-    vm_set_pu: FloatArray
-    q_min_mvar: FloatArray
-    q_max_mvar: FloatArray
-    g_shunt_pu: FloatArray
-    b_shunt_pu: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Branches:
-    """Columns of the branch table, each of length n_branch and read-only.
-
-    Attributes
-    ----------
-    name
-        ``from-to``; a parallel circuit carries ``#2``, ``#3``, …
-    from_bus, to_bus
-        Positions of the end buses.
-    r_pu, x_pu, g_pu, b_pu
-        Series impedance and total charging admittance. [p.u.]
-    tap
-        Ratio at the from end; 1 where there is no transformer.
-    shift_rad
-        Phase shift at the from end. [rad]
-    in_service
-        Whether the branch is closed at both ends.
-    """
-
-    name: tuple[str, ...]
-    from_bus: IntArray
-    to_bus: IntArray
-    r_pu: FloatArray
-    x_pu: FloatArray
-    g_pu: FloatArray
-    b_pu: FloatArray
-    tap: FloatArray
-    shift_rad: FloatArray
-    in_service: npt.NDArray[np.bool_]
-
-
-_INTEGER = {"from_bus", "to_bus"}
-
-OPTIONAL: Mapping[str, float | bool] = MappingProxyType(
-    {
-        "p_load_mw": 0.0,
-        "q_load_mvar": 0.0,
-        "p_gen_mw": 0.0,
-        "vm_set_pu": 1.0,
-        "q_min_mvar": -np.inf,
-        "q_max_mvar": np.inf,
-        "g_shunt_pu": 0.0,
-        "b_shunt_pu": 0.0,
-        "g_pu": 0.0,
-        "b_pu": 0.0,
-        "tap": 1.0,
-        "shift_rad": 0.0,
-        "in_service": True,
-    }
-)
-"""Value of the columns of buses and branches that a table may leave out."""
-
-
-def _branch_names(branches: pd.DataFrame) -> list[str]:
-    ends = branches["from_bus"].astype(str) + "-" + branches["to_bus"].astype(str)
-    copy = ends.groupby(ends).cumcount() + 1
-    return [end if k == 1 else f"{end}#{k}" for end, k in zip(ends, copy, strict=True)]
-
-
-def _freeze(columns: Columns) -> None:
-    """Give every column its type, one length, and no way to be written to."""
-    length = len(columns.name)
-    for field in dataclasses.fields(columns):
-        if field.name == "name":
-            object.__setattr__(columns, "name", tuple(map(str, columns.name)))
-            continue
-        kind: npt.DTypeLike = np.float64
-        if field.name in _INTEGER:
-            kind = np.int64
-        elif field.name == "in_service":
-            kind = np.bool_
-        elif field.name == "kind":
-            kind = np.int8
-        array = np.array(getattr(columns, field.name), dtype=kind)
-        if array.shape != (length,):
-            raise GridError(
-                f"{type(columns).__name__}.{field.name}: expected {length} values, one per name, "
-                f"received shape {array.shape}"
-            )
-        array.flags.writeable = False
-        object.__setattr__(columns, field.name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +62,8 @@ class Network:
     branches: Branches
 
     def __post_init__(self) -> None:
-        _freeze(self.buses)
-        _freeze(self.branches)
+        freeze(self.buses)
+        freeze(self.branches)
         bus, branch = self.buses, self.branches
         if not self.base_mva > 0:
             raise GridError(f"{self.name}: base_mva must be positive, received {self.base_mva}")
@@ -429,7 +303,7 @@ class Network:
         given = {k: v for k, v in OPTIONAL.items() if k in own and k not in branches}
         branches = branches.assign(**given)
         if "name" not in branches and {"from_bus", "to_bus"} <= set(branches.columns):
-            branches = branches.assign(name=_branch_names(branches))
+            branches = branches.assign(name=branch_names(branches))
         wanted = {
             "network": (network, ["name", "base_mva"]),
             "buses": (buses, [f.name for f in dataclasses.fields(Buses)]),

@@ -10,7 +10,8 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from pse_analysis.errors import GridError, NotConverged
-from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.grid.elements import BusKind
+from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 
 FloatArray = npt.NDArray[np.float64]

@@ -12,7 +12,8 @@ from scipy.linalg import lu_factor, lu_solve
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid import power_flow
-from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.grid.elements import BusKind
+from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.simulation.profiles import PROFILE_STEP_S, ar1, between, bridge, column

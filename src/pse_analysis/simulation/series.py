@@ -15,7 +15,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.grid.elements import BusKind
+from pse_analysis.grid.network import Network
 from pse_analysis.parameters import Study
 from pse_analysis.simulation import faults
 from pse_analysis.simulation.case import sample_tables, utc

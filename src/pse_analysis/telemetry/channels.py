@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import TableError
-from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.grid.elements import BusKind
+from pse_analysis.grid.network import Network
 from pse_analysis.machine import INPUT, STATES, Machine
 from pse_analysis.measurement import Model
 from pse_analysis.vocabulary import UNITS, Quantity, check
