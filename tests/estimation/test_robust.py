@@ -57,25 +57,6 @@ def test_trace_matches_the_trace() -> None:
     assert inflated == pytest.approx(found.innovation @ found.innovation)
 
 
-def test_others_are_what_the_other_channels_say() -> None:
-    """Delete the channel: condition it on all others, whose noise is inflated."""
-    found = suspicion(np.random.default_rng(SEED), wrong=(3, 7))
-    inflation = np.zeros(12)
-    inflation[[3, 7]] = 50.0, 80.0
-    square, variance, nis = robust._Others(found)(inflation)
-    S = found.chol_S @ found.chol_S.T
-    inflated = S + np.diag(inflation * found.noise)
-    for i in range(12):
-        rest = np.delete(np.arange(12), i)
-        gain = np.linalg.solve(inflated[np.ix_(rest, rest)], S[rest, i])
-        assert square[i] == pytest.approx(
-            (found.innovation[i] - gain @ found.innovation[rest]) ** 2
-        )
-        assert variance[i] == pytest.approx(S[i, i] - gain @ S[rest, i])
-    expected = found.innovation @ np.linalg.solve(inflated, found.innovation)
-    assert nis == pytest.approx(expected)
-
-
 def test_wrong_channels_are_named_and_no_others() -> None:
     rng = np.random.default_rng(SEED)
     for wrong in ((3,), (0, 5), (1, 4, 9)):

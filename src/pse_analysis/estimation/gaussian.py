@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from pse_analysis.estimation import robust
 from pse_analysis.estimation.conditioning import Posterior, Predicted, Prior
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.holt import Process
 from pse_analysis.estimation.noise import Learnt, Noise
-from pse_analysis.estimation.robust import Judge, Protection
+from pse_analysis.estimation.robust import Judge, Protection, Suspicion
 from pse_analysis.estimation.square_root import carried
+from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout, wrap
@@ -226,7 +229,9 @@ class GaussianFilter:
         angular = self.model.angular[rows]
         at = prior.s
         converged = False
-        verdict = None if judge is robust.none else judge
+        verdict = None
+        if judge is not robust.none:
+            verdict = partial(_with_slopes, judge, lambda: self.model.jacobian(prior.x)[rows])
         for passes in range(1, self.observation.passes + 1):  # noqa: B007 (reported below)
             predicted = self.observation.predict(prior, snapshot, rows, tuned, at)
             eta = snapshot.z[rows] - predicted.mean
@@ -280,6 +285,12 @@ def _through(transition: FloatArray, root: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ij,jnk->ink", transition, blocks).reshape(root.shape))
 
 
+def _with_slopes(
+    judge: Judge, slopes: Callable[[], sparse.csr_array], found: Suspicion
+) -> FloatArray:
+    return judge(replace(found, slopes=slopes))
+
+
 def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianFilter) -> Estimator:
     """Estimator that starts a filter from weighted least squares.
 
@@ -301,7 +312,7 @@ def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianF
     inside = np.ix_(columns, columns)
 
     def init(snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
-        solution, info = wls.begin(snapshot)
+        solution, info = begin(wls, snapshot)
         if solution is None:
             return None, info
         return made.begin(solution.x, solution.covariance()[inside], snapshot.time), info

@@ -18,6 +18,7 @@ from pse_analysis.estimation import intervals
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
 from pse_analysis.estimation.screening import Refuse
+from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import RectangularModel, SensorLayout
@@ -162,7 +163,7 @@ def kalman_filter(
         return covariance
 
     def init(snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
-        solution, info = wls.begin(snapshot)
+        solution, info = begin(wls, snapshot)
         if solution is None:
             return None, info
         n = network.n_bus

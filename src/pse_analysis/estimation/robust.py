@@ -14,10 +14,11 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, stats
+from scipy import sparse, stats
 from scipy.linalg import lapack
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.estimation.deletion import Deletion, of_snapshot
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -27,6 +28,9 @@ CONFIDENCE = 0.999
 """Share of snapshots without gross errors that pass the gate of a perfectly tuned filter."""
 MARGIN = 9.0
 """g: squared deviation, in units of its variance, up to which a channel is fully believed."""
+FAR = 6.0
+"""Deviation from the forecast, in units of √S_ii, from which the search for wrong channels starts.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +49,8 @@ class Suspicion:
         Lower Cholesky factor of S; what stands above the diagonal does not count.
     nis : float
         ηᵀS⁻¹η.
+    slopes : callable, optional
+        Gives ∂h/∂x at the forecast, (m, n); a judge that has it can ask the snapshot alone.
     """
 
     innovation: FloatArray
@@ -52,6 +58,7 @@ class Suspicion:
     noise: FloatArray
     chol_S: FloatArray
     nis: float
+    slopes: Callable[[], sparse.csr_array] | None = None
 
 
 Judge = Callable[[Suspicion], FloatArray]
@@ -89,77 +96,58 @@ def trace(found: Suspicion) -> FloatArray:
     return np.full(len(found.innovation), max(0.0, float(excess / found.noise.sum())))
 
 
-class _Others:
-    """What the forecast and all other channels say about each channel, under S + diag(φR).
-
-    The suspects' rows are all in which that matrix differs from S, so that one triangular inverse
-    of chol(S) serves every φ: it gives single entries of the inverse, no gain.
-    """
-
-    def __init__(self, found: Suspicion) -> None:
-        self._found = found
-        half, _ = lapack.dtrtri(found.chol_S, lower=1)
-        self._half = np.tril(half)
-        self._weighted = self._half.T @ (self._half @ found.innovation)
-        self._precision = np.einsum("ij,ij->j", self._half, self._half)
-
-    def __call__(self, inflation: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Squared deviation e² and its variance v by channel, and ηᵀ(S + φR)⁻¹η."""
-        eta, noise = self._found.innovation, self._found.noise
-        precision, weighted = self._precision, self._weighted
-        suspect = np.flatnonzero(inflation)
-        if len(suspect):
-            columns = self._half.T @ self._half[:, suspect]
-            core = columns[suspect] + np.diag(1.0 / (inflation[suspect] * noise[suspect]))
-            right = np.column_stack([columns.T, weighted[suspect]])
-            chol = linalg.cholesky(core, lower=True, check_finite=False)
-            solved = linalg.solve_triangular(chol, right, lower=True, check_finite=False)
-            across, drawn = solved[:, :-1], solved[:, -1]
-            precision = precision - np.einsum("ij,ij->j", across, across)
-            weighted = weighted - drawn @ across
-        return (
-            (weighted / precision) ** 2,
-            1.0 / precision - inflation * noise,
-            float(weighted @ eta),
-        )
-
-
 def per_channel(found: Suspicion) -> FloatArray:
     """A factor for every channel, which names the wrong ones.
 
     Returns
     -------
     (m,) ndarray
-        φ_i = max(0, e_i² - g v_i)/R_ii. At first e = η and v = diag S. The gate is then closed
-        again on what is left: e_i is now the deviation of channel i from what the forecast *and
-        all other channels*, with their inflated noise, say, and v_i the variance of that. Suspects
-        that the others confirm are cleared; and as long as the snapshot does not pass the gate,
-        the channel that deviates most is named as well, one at a time, because a wrong channel
-        makes its neighbours look wrong too.
+        φ_i = max(0, b_i² - g v_i)/R_i for the channels that are named, where b_i is how far one is
+        off what the forecast and all channels that are believed say of it, and v_i the variance
+        that this should have; zero for the others.
 
     Notes
     -----
-    With S' = S + diag(φR): e_i = (S'⁻¹η)_i/(S'⁻¹)_ii and v_i = 1/(S'⁻¹)_ii - φ_i R_i.
+    Beyond [qu2018]. The search (`Deletion.search`) starts from all that the forecast alone
+    contradicts by far, which a gross error cannot hide, and ends where no channel is worth leaving
+    out or taking back, at the price of the gate's bound on one channel. Then the accused are heard:
+    a channel is acquitted if the rest of the snapshot *without the forecast* agrees with it and
+    rules the error out that it is accused of. So a movement of the load that many channels see is
+    taken for one, whatever little the process noise allows.
     """
     eta, noise = found.innovation, found.noise
     total, largest = gate(len(eta))
     if found.nis <= total and (eta**2 <= largest * found.variance).all():
         return np.zeros(len(eta))
-    others = _Others(found)
-    inflation = np.maximum(0.0, eta**2 - MARGIN * found.variance) / noise
-    square, variance, nis = others(inflation)
-    confirmed = (inflation > 0) & (square < MARGIN * variance)
-    if confirmed.any():
-        inflation[confirmed] = 0.0
-        square, variance, nis = others(inflation)
-    for _ in range(len(eta)):
-        excess = np.where(inflation > 0, 0.0, square / variance)
-        worst = int(np.argmax(excess))
-        if nis <= total or excess[worst] <= MARGIN:
-            break
-        inflation[worst] = (square[worst] - MARGIN * variance[worst]) / noise[worst]
-        square, variance, nis = others(inflation)
-    return inflation
+    half, _ = lapack.dtrtri(found.chol_S, lower=1)
+    half = np.tril(half)
+    deletion = Deletion(
+        half.T @ (half @ eta),
+        np.einsum("ij,ij->j", half, half),
+        lambda rows: half.T @ half[:, rows],
+        found.nis,
+    )
+    named, standing = deletion.search(eta**2 > FAR**2 * found.variance, largest)
+    if named.any() and found.slopes is not None:
+        acquitted = _acquitted(
+            found, found.slopes(), np.flatnonzero(named), standing.error, largest
+        )
+        if len(acquitted):
+            named[acquitted] = False
+            standing = deletion.without(named)
+    excess = np.maximum(standing.error**2 - MARGIN * standing.variance, 0.0)
+    return np.where(named, np.divide(excess, noise, where=named, out=np.zeros_like(noise)), 0.0)
+
+
+def _acquitted(
+    found: Suspicion, H: sparse.csr_array, named: IntArray, accused: FloatArray, price: float
+) -> IntArray:
+    """Those of the named channels that the snapshot without the forecast confirms."""
+    heard = of_snapshot(H, found.innovation, found.noise, named)
+    contradicted, standing = heard.search(np.ones(len(named), dtype=bool), price, most=1.0)
+    confirmed = ~contradicted & (standing.ratio < MARGIN)
+    excluded = (standing.error - accused[named]) ** 2 > price * standing.variance
+    return named[confirmed & excluded]
 
 
 JUDGES: dict[str, Judge] = {"none": none, "trace": trace, "per_channel": per_channel}
@@ -180,7 +168,7 @@ class Protection:
     """
 
     patience: int = 3
-    share: float = 0.04
+    share: float = 0.02
     sigma: float = 0.05
 
     def __post_init__(self) -> None:

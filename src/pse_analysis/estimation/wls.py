@@ -29,6 +29,10 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 
+COARSE = 1e-4
+"""Largest step of a converged state whose rows are weighed by their residuals. [rad, p.u.]"""
+
+
 def state_columns(network: Network, layout: SensorLayout) -> npt.NDArray[np.int64]:
     """Columns of [θ; |V|] to be estimated.
 
@@ -193,6 +197,7 @@ class WeightedLeastSquares:
         available: BoolArray | None = None,
         *,
         start: FloatArray | None = None,
+        huber: float | None = None,
     ) -> WlsSolution:
         """Estimate the state.
 
@@ -205,6 +210,10 @@ class WeightedLeastSquares:
         start : (2N,) ndarray, optional
             [θ; |V|] to start from; flat by default, or, where currents are measured, the solution
             of the linear form of the measurements.
+        huber : float, optional
+            Residual, in units of σ, beyond which the cost of a row grows with the residual instead
+            of its square, so that no row pulls harder; to `COARSE`, and with the covariance of the
+            weights at the end.
 
         Returns
         -------
@@ -225,7 +234,7 @@ class WeightedLeastSquares:
         if start is None and (self._current & rows).any():
             x = self._linear_start(observed, sigma, rows)
         try:
-            x, iterations, converged = self._iterate(x, observed, weight, self.tolerance)
+            x, iterations, converged = self._iterate(x, observed, weight, huber)
         except Unobservable as error:
             raise Unobservable(self._explain(x, weight, str(error))) from error
         residual = self.model.residual(observed, x)
@@ -264,38 +273,22 @@ class WeightedLeastSquares:
             return self.flat_start()
         return np.concatenate([np.angle(voltage), np.abs(voltage)])
 
-    def begin(self, snapshot: Snapshot) -> tuple[WlsSolution | None, Info]:
-        """Start a filter: the estimate of its first snapshot, or None and why there is none."""
-        m = self.model.shape[0]
-        try:
-            solution = self.solve(snapshot.z, snapshot.sigma, snapshot.available)
-        except Unobservable as error:
-            return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
-        if not solution.converged:
-            return None, Info.nothing(m, Status.NOT_CONVERGED, "no start from least squares")
-        used = snapshot.available
-        return solution, Info(
-            Status.OK,
-            solution.iterations,
-            np.nan,
-            0,
-            used,
-            np.where(used, solution.residual, np.nan),
-            np.where(used, snapshot.sigma, np.nan),
-            np.zeros(m),
-        )
-
     def _iterate(
-        self, x: FloatArray, z: FloatArray, weight: FloatArray, tolerance: float
+        self, x: FloatArray, z: FloatArray, weight: FloatArray, huber: float | None
     ) -> tuple[FloatArray, int, bool]:
         model = self.model
-        entry_weight = weight[model.row_of_entry]
+        tolerance = self.tolerance if huber is None else COARSE
+        counted = weight
         for iteration in range(1, self.max_iterations + 1):
-            whitened = model.jacobian_data(x) * entry_weight
+            residual = model.residual(z, x)
+            if huber is not None:
+                far = np.maximum(np.abs(weight * residual) / huber, 1.0)
+                counted = weight / np.sqrt(far)
+            whitened = model.jacobian_data(x) * counted[model.row_of_entry]
             self._gain.factorise(whitened)
             gradient = np.bincount(
                 model.indices,
-                weights=whitened * (weight * model.residual(z, x))[model.row_of_entry],
+                weights=whitened * (counted * residual)[model.row_of_entry],
                 minlength=model.shape[1],
             )
             step = self._gain.solve(gradient.astype(float, copy=False))
