@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 
 from pse_analysis.drawing import BLUE, GREEN, ORANGE, VERMILION
 from pse_analysis.recording import stream as marks
-from pse_analysis.recording.telemetry import MAX_SERIES, of_trial, open_on
+from pse_analysis.recording.tables import MAX_SERIES, of_trial, open_on
 from pse_analysis.vocabulary import FaultKind, Flag
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from pse_analysis.drawing import GREEN, GREY, ORANGE, SOURCES, VERMILION, method_colours
 from pse_analysis.grid.network import Network
 from pse_analysis.recording import stream as marks
-from pse_analysis.recording.telemetry import of_trial, open_on
+from pse_analysis.recording.tables import of_trial, open_on
 
 if TYPE_CHECKING:
     from pse_analysis.parameters import Study

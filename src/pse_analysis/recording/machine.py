@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from pse_analysis.drawing import GREEN, GREY, ORANGE, SOURCES, VERMILION, method_colours
 from pse_analysis.machine import STATES
 from pse_analysis.recording import stream as marks
-from pse_analysis.recording.telemetry import of_trial, open_on
+from pse_analysis.recording.tables import of_trial, open_on
 
 if TYPE_CHECKING:
     from pse_analysis.parameters import Study
