@@ -17,6 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
+FEW = 4
+"""Up to one in so many channels, inflated noise is added to S by a correction of its factor."""
+
 Verdict = Callable[[Suspicion], FloatArray]
 """Inflation φ (m,) of the noise that an innovation calls for."""
 
@@ -153,17 +156,38 @@ class Moments(NamedTuple):
         chol_S = factor(self.own, variance)
         white = solve(chol_S, innovation)
         nis = float(white @ white)
-        inflation = np.zeros(len(noise))
+        inflation, relaxed = np.zeros(len(noise)), None
         if verdict is not None:
             inflation = verdict(Suspicion(innovation, variance, noise, chol_S, nis))
-        if inflation.any():
+        wrong = np.flatnonzero(inflation)
+        if FEW * len(wrong) > len(noise):
             chol_S = factor(self.own, variance + inflation * noise)
             white = solve(chol_S, innovation)
             nis = float(white @ white)
+        elif len(wrong):
+            relaxed = _relaxation(chol_S, wrong, (inflation * noise)[wrong])
+            through = relaxed @ white
+            white = white - relaxed.T @ through
+            nis -= float(through @ through)
         X = blas.dtrsm(1.0, chol_S, self.cross, side=1, lower=1, trans_a=1)
         # P is symmetric, so that its transpose is itself in the order that BLAS reads.
         lower = blas.dsyrk(-1.0, X, beta=1.0, c=prior.P.T, lower=1)
+        if relaxed is not None:
+            lower = blas.dsyrk(1.0, X @ relaxed.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
         return Posterior(prior.s + X @ white, symmetric(lower), variance, inflation, nis)
+
+
+def _relaxation(chol_S: FloatArray, rows: IntArray, added: FloatArray) -> FloatArray:
+    """Y of Lᵀ(S + U diag(a) Uᵀ)⁻¹L = I - YᵀY, for S = L Lᵀ and a few rows U of the identity.
+
+    It spares a second factorisation.
+    """
+    unit = np.zeros((len(chol_S), len(rows)), order="F")
+    unit[rows, np.arange(len(rows))] = 1.0
+    V = solve(chol_S, unit)
+    core = V.T @ V
+    core[np.diag_indices_from(core)] += 1.0 / added
+    return solve(cholesky(core), V.T)
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:

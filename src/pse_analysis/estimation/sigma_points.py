@@ -17,13 +17,14 @@ import numpy.typing as npt
 from scipy import sparse
 
 from pse_analysis.estimation.conditioning import Prior
-from pse_analysis.measurement import IA, IM, VA, VM, MeasurementModel, P, Q
+from pse_analysis.measurement import IM, VA, VM, MeasurementModel, P, Q
 from pse_analysis.measurement.layout import Terminals
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 Parts = tuple[FloatArray, FloatArray]
+Rows = slice | IntArray
 
 
 class Spread(NamedTuple):
@@ -35,18 +36,20 @@ class Spread(NamedTuple):
         s: the points stand √s columns of chol(P) from the mean.
     centre : (m,) ndarray
         γ₀.
-    odd : (m, n) ndarray
-        d_i in its columns.
+    linear, entry : (m-k,) ndarray of int
+        Rows that read one entry of s each, and which; -1 for one that is fixed.
     curved : (k,) ndarray of int
-        Rows that are not linear in x.
-    even, shift : (k, n), (k,) ndarray
-        e_i in its columns, and ē, of the curved rows.
+        The other rows.
+    odd, even, shift : (k, n), (k, n), (k,) ndarray
+        d_i and e_i in columns, and ē, of the curved rows.
     """
 
     square: float
     centre: FloatArray
-    odd: FloatArray
+    linear: IntArray
+    entry: IntArray
     curved: IntArray
+    odd: FloatArray
     even: FloatArray
     shift: FloatArray
 
@@ -56,6 +59,13 @@ class Spread(NamedTuple):
         out = self.centre.copy()
         out[self.curved] += self.shift
         return out
+
+
+def run(rows: IntArray) -> Rows:
+    """Rows as a slice where they follow each other, which spares a copy."""
+    if len(rows) and rows[-1] - rows[0] + 1 == len(rows) and (np.diff(rows) == 1).all():
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows
 
 
 class _Pairs(NamedTuple):
@@ -68,7 +78,7 @@ class _Pairs(NamedTuple):
     odd: ComplexArray
     rise: ComplexArray | None
 
-    def take(self, rows: IntArray) -> _Pairs:
+    def take(self, rows: Rows) -> _Pairs:
         rise = None if self.rise is None else self.rise[rows]
         return _Pairs(self.centre[rows], self.odd[rows], rise)
 
@@ -112,27 +122,31 @@ class SigmaPoints:
         Spread
         """
         n, a = prior.n, self._angles
-        step = np.sqrt(square) * prior.chol_P[:n, :n]
         straight = self._straight[rows]
         linear, curved = np.flatnonzero(straight), np.flatnonzero(~straight)
-        odd, even = np.empty((len(rows), n)), np.empty((len(curved), n))
-        entry = self._entry[rows[linear]]
-        odd[linear] = step[entry]
-        odd[linear[entry < 0]] = 0.0  # an angle that is fixed
+        odd, even = np.empty((2, len(curved), n))
         if len(curved):
-            quantity, terminal = self.model.layout.quantity[rows], self._terminals.of_row[rows]
-            kinds = [(q, np.flatnonzero(quantity == q)) for q in (P, Q, IM, IA)]
-            place = np.cumsum(~straight) - 1
+            step = np.sqrt(square) * prior.chol_P[:n, :n]
+            quantity = self.model.layout.quantity[rows[curved]]
+            terminal = self._terminals.of_row[rows[curved]]
+            rows_of = {q: np.flatnonzero(quantity == q) for q in np.unique(quantity)}
+            kinds = [(q, run(at), run(terminal[at])) for q, at in rows_of.items()]
             turned, stretched = self._phasors(prior, step)
             for columns, phasors in ((slice(0, a), turned), (slice(a, n), stretched)):
                 found = _Parts(*phasors)
-                for q, at in kinds:
-                    if len(at):
-                        first, second = found.of(q)
-                        odd[at, columns] = first[terminal[at]]
-                        even[place[at], columns] = second[terminal[at]]
-        centre = self.model.h(prior.x)[rows]
-        return Spread(square, centre, odd, curved, even, even.sum(axis=1) / square)
+                for q, at, source in kinds:
+                    first, second = found.of(q)
+                    odd[at, columns], even[at, columns] = first[source], second[source]
+        return Spread(
+            square,
+            self.model.h(prior.x)[rows],
+            linear,
+            self._entry[rows[linear]],
+            curved,
+            odd,
+            even,
+            even.sum(axis=1) / square,
+        )
 
     def _phasors(
         self, prior: Prior, step: FloatArray
@@ -153,10 +167,11 @@ class SigmaPoints:
         admittance = sparse.csr_array((turned, y.y.indices, y.y.indptr), shape=y.y.shape)
         current = admittance @ np.hstack([real, odd, rise, across])
         middle, by_odd, by_rise, by_size = np.split(current, (1, 1 + a, 1 + 2 * a), axis=1)
+        metered = run(y.metered)
         stretched = _Pairs(real, across.astype(np.complex128), None)
         return (
-            (_Pairs(real, odd, rise).take(y.metered), _Pairs(middle, by_odd, by_rise)),
-            (stretched.take(y.metered), _Pairs(middle, by_size, None)),
+            (_Pairs(real, odd, rise).take(metered), _Pairs(middle, by_odd, by_rise)),
+            (stretched.take(metered), _Pairs(middle, by_size, None)),
         )
 
 

@@ -36,7 +36,7 @@ from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.conditioning import Moments, Predicted, Prior
 from pse_analysis.estimation.estimator import Snapshot
 from pse_analysis.estimation.gaussian import Observation
-from pse_analysis.estimation.sigma_points import SigmaPoints, Spread
+from pse_analysis.estimation.sigma_points import Rows, SigmaPoints, Spread, run
 from pse_analysis.estimation.square_root import Halves
 from pse_analysis.measurement import BUS, FROM, TO, MeasurementModel, P, Q, wrap
 
@@ -84,27 +84,40 @@ def _bent(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Float
 
 
 def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Moments:
-    """The prediction as a mean and covariances, under the α that the spread was made with."""
-    n, inverse = prior.n, 1.0 / spread.square
-    # Fortran order is what BLAS reads without a copy; odd.T has it.
-    own = blas.dsyrk(inverse, spread.odd.T, trans=1, lower=1)
+    """The prediction as a mean and covariances, under the α that the spread was made with.
+
+    A row that reads an entry of s has that entry's column of P for its column of C, and S of it
+    with any row is an entry of C: products are needed for the curved rows only.
+    """
+    m, n = len(spread.centre), prior.n
+    # Row by row here: column by column, as BLAS reads it, in what is returned.
+    cross, own = np.zeros((m, len(prior.s))), np.zeros((m, m))
+    read = spread.entry >= 0
+    linear, entry, curved = run(spread.linear[read]), spread.entry[read], run(spread.curved)
     if len(spread.curved):
-        bent = _bent(prior, spread, scaling, alpha)
-        inside = _run(spread.curved)
-        own[inside] += blas.dsyrk(inverse, bent.T, trans=1, lower=1)
-    root, chol_P = np.sqrt(inverse), prior.chol_P
-    if len(chol_P) == n:
-        cross = blas.dtrmm(root, chol_P, spread.odd.T, lower=1)
-    else:
-        cross = blas.dgemm(root, chol_P[:, :n], spread.odd.T)
-    return Moments(spread.mean, own, cross, alpha)
+        root = 1.0 / np.sqrt(spread.square)
+        if n == len(prior.s):
+            product = blas.dtrmm(root, prior.chol_P, spread.odd.T, lower=1)
+        else:
+            product = blas.dgemm(root, prior.chol_P[:, :n], spread.odd.T)
+        cross[curved] = product.T
+        both = np.hstack([spread.odd, _bent(prior, spread, scaling, alpha)])
+        own[_block(curved, curved)] = blas.dsyrk(root**2, both.T, trans=1, lower=1).T
+        own[_block(curved, linear)] = product[entry].T
+    cross[linear] = prior.P[entry]
+    own[linear] = cross[:, entry].T
+    return Moments(spread.mean, own.T, cross.T, alpha)
 
 
 def halves(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Halves:
     """The prediction as a mean and weighted deviations."""
-    root = np.sqrt(1.0 / spread.square)
+    root = 1.0 / np.sqrt(spread.square)
+    odd = np.zeros((len(spread.centre), prior.n))
+    read = spread.entry >= 0
+    odd[spread.linear[read]] = prior.chol_P[spread.entry[read], : prior.n]
+    odd[spread.curved] = root * spread.odd
     bent = root * _bent(prior, spread, scaling, alpha)
-    return Halves(spread.mean, root * spread.odd, spread.curved, bent, alpha)
+    return Halves(spread.mean, odd, spread.curved, bent, alpha)
 
 
 _FORMS: dict[Form, Callable[[Prior, Spread, Scaling, float], Predicted]] = {
@@ -213,12 +226,11 @@ def by_likelihood(
     return Observation(predict, scaling.alpha)
 
 
-def _run(rows: IntArray) -> tuple[slice, slice] | tuple[IntArray, IntArray]:
-    """Index of a square block; slices, which spare a copy, where its rows follow each other."""
-    if rows[-1] - rows[0] + 1 == len(rows):
-        run = slice(int(rows[0]), int(rows[-1]) + 1)
-        return run, run
-    return rows[:, None], rows[None, :]
+def _block(rows: Rows, columns: Rows) -> tuple[Rows | IntArray, Rows | IntArray]:
+    """Index of a block of a matrix."""
+    if isinstance(rows, slice) or isinstance(columns, slice):
+        return rows, columns
+    return rows[:, None], columns[None, :]
 
 
 def _square(scaling: Scaling, alpha: float, n: int) -> float:
