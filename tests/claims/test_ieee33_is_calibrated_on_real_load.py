@@ -8,55 +8,30 @@ ones.
 
 from __future__ import annotations
 
-import dataclasses
-from pathlib import Path
+from dataclasses import replace
 
 import pandas as pd
 import pytest
 
-from pse_analysis.alignment import align
-from pse_analysis.estimation import estimate
-from pse_analysis.grid import library
 from pse_analysis.pipeline.case import load_case
+from pse_analysis.pipeline.monte_carlo import monte_carlo
 from pse_analysis.pipeline.stages import check_case
-from pse_analysis.scoring import score
-from pse_analysis.simulation import profiles, simulate
-from pse_analysis.validation import validate
 
-ROOT = Path(__file__).parents[2]
 SEEDS = range(1, 11)
 
 
 @pytest.fixture(scope="module")
 def scores() -> pd.DataFrame:
     """Scores of wls and kf_load, one row per method and seed, metrics in columns."""
-    case = load_case("ieee33", ROOT / "pipelines" / "cases")
-    settings = check_case(case)
-    assert settings.simulate is not None
-    network = library.load("ieee33")
-    curves = profiles.load(ROOT / "data" / "raw" / "load_profiles")
-    methods = [m for m in settings.estimate.methods if m.name in ("wls", "kf_load")]
-    rows = []
-    for seed in SEEDS:
-        drawn = dataclasses.replace(settings.simulate, seed=seed, trials=1)
-        raw = simulate(network, curves, settings.study, drawn)
-        validated = validate(
-            raw.telemetry, raw.channels, settings.validate, history_end=settings.study.start
-        )
-        aligned = align(validated, raw.channels, network, settings.study, settings.align)
-        results = [
-            estimate(aligned, raw.channels, network, settings.study, method, truth=raw.truth)
-            for method in methods
-        ]
-        scored = score(
-            pd.concat([r.estimated for r in results]),
-            pd.concat([r.steps for r in results]),
-            validated,
-            raw.truth,
-        )
-        whole = scored[scored["element"] == ""]
-        rows.append(whole.pivot_table(index="method", columns="metric", values="value"))
-    return pd.concat(rows, keys=SEEDS, names=["seed"]).reset_index()
+    settings = check_case(load_case("ieee33"))
+    methods = tuple(m for m in settings.estimate.methods if m.name in ("wls", "kf_load"))
+    world = replace(
+        settings,
+        simulate=replace(settings.simulate, trials=1),
+        estimate=replace(settings.estimate, methods=methods),
+    )
+    table = monte_carlo("ieee33", {"case": world}, SEEDS, workers=1)
+    return table.pivot(index=["method", "seed"], columns="metric", values="value").reset_index()
 
 
 def test_nis_and_coverage_lie_in_the_bounds_of_real_load(scores: pd.DataFrame) -> None:
