@@ -4,8 +4,8 @@ A pair of points x ± δ turns a voltage by ± dθ and lengthens it by ± dV, so
 difference of the pair have closed forms. Currents are linear in the voltages, powers are products
 of both, and their odd and even parts follow from those of the phasors: one cosine serves both
 points, nothing large is subtracted, and the directions that turn no angle are cheaper still. Every
-phasor stands in the frame of a bus's own angle, where its voltage is real; the admittances are
-turned into these frames instead.
+phasor stands in the frame of its bus's angle, or of the bus where it is metered, so that the
+voltage at the centre is real.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from pse_analysis.estimation.conditioning import Prior
 from pse_analysis.measurement import IM, VA, VM, MeasurementModel, P, Q
@@ -78,13 +77,23 @@ class _Pairs(NamedTuple):
     odd: ComplexArray
     rise: ComplexArray | None
 
-    def take(self, rows: Rows) -> _Pairs:
-        rise = None if self.rise is None else self.rise[rows]
-        return _Pairs(self.centre[rows], self.odd[rows], rise)
-
     def ends(self) -> tuple[ComplexArray, ComplexArray]:
         middle = self.centre if self.rise is None else self.centre + self.rise
         return middle + self.odd, middle - self.odd
+
+
+class _Pattern(NamedTuple):
+    """What some rows of a layout read.
+
+    ``kinds`` has for every quantity of the curved rows: which of these they are, and their
+    terminals.
+    """
+
+    rows: IntArray
+    linear: IntArray
+    entry: IntArray
+    curved: IntArray
+    kinds: list[tuple[int, Rows, Rows]]
 
 
 class SigmaPoints:
@@ -106,6 +115,19 @@ class SigmaPoints:
         bus = np.where(self._straight, layout.position, 0)
         self._entry = place[bus + np.where(layout.quantity == VM, n_bus, 0)]
         self._terminals = Terminals(model.network, layout)
+        self._metered = run(self._terminals.metered)
+        self._columns = run(model.columns)
+        self._pattern = self._pattern_of(np.arange(len(layout)))
+
+    def _pattern_of(self, rows: IntArray) -> _Pattern:
+        linear, curved = (
+            np.flatnonzero(part) for part in (self._straight[rows], ~self._straight[rows])
+        )
+        quantity = self.model.layout.quantity[rows[curved]]
+        terminal = self._terminals.of_row[rows[curved]]
+        rows_of = {int(q): np.flatnonzero(quantity == q) for q in np.unique(quantity)}
+        kinds = [(q, run(at), run(terminal[at])) for q, at in rows_of.items()]
+        return _Pattern(rows, linear, self._entry[rows[linear]], curved, kinds)
 
     def spread(self, prior: Prior, square: float, rows: IntArray) -> Spread:
         """Odd and even parts of h along the columns of √s chol(P), for some rows of the layout.
@@ -121,58 +143,50 @@ class SigmaPoints:
         -------
         Spread
         """
+        if not np.array_equal(rows, self._pattern.rows):
+            # Mostly the same channels report at every instant.
+            self._pattern = self._pattern_of(rows)
+        _, linear, entry, curved, kinds = self._pattern
         n, a = prior.n, self._angles
-        straight = self._straight[rows]
-        linear, curved = np.flatnonzero(straight), np.flatnonzero(~straight)
         odd, even = np.empty((2, len(curved), n))
-        if len(curved):
-            step = np.sqrt(square) * prior.chol_P[:n, :n]
-            quantity = self.model.layout.quantity[rows[curved]]
-            terminal = self._terminals.of_row[rows[curved]]
-            rows_of = {q: np.flatnonzero(quantity == q) for q in np.unique(quantity)}
-            kinds = [(q, run(at), run(terminal[at])) for q, at in rows_of.items()]
-            turned, stretched = self._phasors(prior, step)
+        if kinds:
+            turned, stretched = self._phasors(prior, np.sqrt(square) * prior.chol_P[:n, :n])
             for columns, phasors in ((slice(0, a), turned), (slice(a, n), stretched)):
                 found = _Parts(*phasors)
                 for q, at, source in kinds:
                     first, second = found.of(q)
                     odd[at, columns], even[at, columns] = first[source], second[source]
-        return Spread(
-            square,
-            self.model.h(prior.x)[rows],
-            linear,
-            self._entry[rows[linear]],
-            curved,
-            odd,
-            even,
-            even.sum(axis=1) / square,
-        )
+        centre = self.model.h(prior.x)[rows]
+        return Spread(square, centre, linear, entry, curved, odd, even, even.sum(axis=1) / square)
 
     def _phasors(
         self, prior: Prior, step: FloatArray
     ) -> tuple[tuple[_Pairs, _Pairs], tuple[_Pairs, _Pairs]]:
         """Voltages and currents of the terminals, along directions that turn angles and others."""
-        n_bus, a, y = self.model.network.n_bus, self._angles, self._terminals
-        ahead, size = np.exp(1j * prior.x[:n_bus]), prior.x[n_bus:, None]
-        full = np.zeros((2 * n_bus, step.shape[1]))
-        full[prior.columns] = step
+        n_bus, a, n = self.model.network.n_bus, self._angles, step.shape[1]
+        size = prior.x[n_bus:, None]
+        full = np.zeros((2 * n_bus, n))
+        full[self._columns] = step
         # L is triangular, and the angles come first.
         turn, along, across = full[:n_bus, :a], full[n_bus:, :a], full[n_bus:, a:]
         sine, cosine = np.sin(0.5 * turn), np.cos(0.5 * turn)
         fall, sine = 2.0 * sine * sine, 2.0 * sine * cosine  # 1 - cos dθ and sin dθ
-        odd = _complex(along - along * fall, size * sine)
-        rise = _complex(-size * fall, along * sine)
-        real = size.astype(np.complex128)
-        turned = y.y.data * ahead[y.entry_col] * ahead.conj()[y.metered[y.entry_row]]
-        admittance = sparse.csr_array((turned, y.y.indices, y.y.indptr), shape=y.y.shape)
-        current = admittance @ np.hstack([real, odd, rise, across])
-        middle, by_odd, by_rise, by_size = np.split(current, (1, 1 + a, 1 + 2 * a), axis=1)
-        metered = run(y.metered)
-        stretched = _Pairs(real, across.astype(np.complex128), None)
-        return (
-            (_Pairs(real, odd, rise).take(metered), _Pairs(middle, by_odd, by_rise)),
-            (stretched.take(metered), _Pairs(middle, by_size, None)),
-        )
+        # Centre, rise and odd part of the first directions, odd part of the others.
+        voltage = np.zeros((n_bus, 1 + a + n), dtype=np.complex128)
+        voltage.real[:, :1] = size
+        voltage.real[:, 1 : 1 + a], voltage.imag[:, 1 : 1 + a] = -size * fall, along * sine
+        voltage.real[:, 1 + a : 1 + 2 * a] = along - along * fall
+        voltage.imag[:, 1 + a : 1 + 2 * a] = size * sine
+        voltage.real[:, 1 + 2 * a :] = across
+        ahead = np.exp(1j * prior.x[:n_bus, None])
+        current = self._terminals.y @ (voltage * ahead)
+        current *= ahead.conj()[self._metered]
+        found = []
+        for phasors in (voltage[self._metered], current):
+            centre, rise = phasors[:, :1], phasors[:, 1 : 1 + a]
+            found.append(_Pairs(centre, phasors[:, 1 + a : 1 + 2 * a], rise))
+            found.append(_Pairs(centre, phasors[:, 1 + 2 * a :], None))
+        return (found[0], found[2]), (found[1], found[3])
 
 
 class _Parts:
@@ -207,9 +221,3 @@ def _product(voltage: _Pairs, current: _Pairs) -> tuple[ComplexArray, ComplexArr
 
 def _halves(first: FloatArray, second: FloatArray, centre: FloatArray) -> Parts:
     return 0.5 * (first - second), 0.5 * (first + second) - centre
-
-
-def _complex(real: FloatArray, imaginary: FloatArray) -> ComplexArray:
-    out = np.empty(real.shape, dtype=np.complex128)
-    out.real, out.imag = real, imaginary
-    return out

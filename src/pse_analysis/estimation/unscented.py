@@ -16,9 +16,14 @@ no e, and a multiple of ē added to every e_i makes one product of the last two 
 which has a real k for every scaling, so that S is never diminished. Slopes behind x do not enter h,
 and the points need not spread along them.
 
-The step is conditioned in one of two forms, which agree to rounding. ``covariance`` carries P,
-takes a symmetric product from it, and repairs a P that rounding left indefinite; ``square_root``
-carries a root of P by orthogonal triangularisation and takes nothing from anything.
+The step is conditioned in one of two forms, whose results agree to rounding. ``covariance`` takes a
+symmetric product from P and repairs, at the next instant, a P that rounding left indefinite;
+``square_root`` carries a root of P by orthogonal triangularisation and takes nothing from
+anything. The former is the default because it measures better: a step takes two thirds of the time
+(``benchmarks/unscented.py``), a gate that stays closed costs nothing because S and its factor are
+there anyway, and its P is definite by itself as long as the variance of every measurement exceeds
+some 1e-15 of what the forecast expects of it, which 1e-5 p.u. does against 1 p.u. Below that, with
+next to no process noise, it is lost, and ``square_root`` is not.
 """
 
 from __future__ import annotations
