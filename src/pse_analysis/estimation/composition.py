@@ -12,7 +12,7 @@ from pse_analysis.estimation.estimator import Estimator
 from pse_analysis.estimation.holt import HoltParams
 from pse_analysis.estimation.noise import VoltageNoise
 from pse_analysis.estimation.robust import Protection
-from pse_analysis.estimation.unscented import Scaling
+from pse_analysis.estimation.unscented import Form, Scaling
 from pse_analysis.estimation.wls import state_columns
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout
@@ -27,6 +27,8 @@ class Composition:
     process : {"random_walk", "holt", "local_trend"}
     scaling : {"fixed", "moments", "likelihood"}
         How an unscented filter chooses α.
+    form : {"covariance", "square_root"}
+        What an unscented filter carries from step to step; see `pse_analysis.estimation.unscented`.
     learning : {"none", "sage_husa"}
         Whether it learns its process noise on the way.
     robustness : {"none", "trace", "per_channel"}
@@ -44,6 +46,7 @@ class Composition:
 
     process: Literal["random_walk", "holt", "local_trend"] = "random_walk"
     scaling: Literal["fixed", "moments", "likelihood"] = "fixed"
+    form: Form = "covariance"
     learning: Literal["none", "sage_husa"] = "none"
     robustness: Literal["none", "trace", "per_channel"] = "none"
     protected: bool = True
@@ -95,7 +98,7 @@ def compose(
             "moments": unscented.by_moments,
             "likelihood": unscented.by_likelihood,
         }[composition.scaling]
-        observation = scaled(model, composition.points)
+        observation = scaled(model, composition.points, composition.form)
     judges = composition.robustness != "none" and composition.protected
     return gaussian.GaussianFilter(
         model,

@@ -21,9 +21,9 @@ symmetric product from P and repairs, at the next instant, a P that rounding lef
 ``square_root`` carries a root of P by orthogonal triangularisation and takes nothing from
 anything. The former is the default because it measures better: a step takes two thirds of the time
 (``benchmarks/unscented.py``), a gate that stays closed costs nothing because S and its factor are
-there anyway, and its P is definite by itself as long as the variance of every measurement exceeds
-some 1e-15 of what the forecast expects of it, which 1e-5 p.u. does against 1 p.u. Below that, with
-next to no process noise, it is lost, and ``square_root`` is not.
+there anyway, and its P stays definite by itself where the variance of every measurement is at least
+1e-12 of what the forecast expects of it, which 1e-6 p.u. is of 1 p.u. At 1e-16 it is not, and with
+next to no process noise the filter is lost, while ``square_root`` goes on.
 """
 
 from __future__ import annotations
