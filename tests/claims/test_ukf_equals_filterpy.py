@@ -16,16 +16,17 @@ ALPHA, BETA = 0.85, 0.05
 
 @pytest.mark.parametrize("grid", ["ieee14", "ieee30"])
 @pytest.mark.parametrize("process", ["random_walk", "holt"])
+@pytest.mark.parametrize("form", ["covariance", "square_root"])
 @pytest.mark.parametrize(
     "points",
     [{"alpha": 1.0, "kappa": 0.0, "beta": 2.0}, {"alpha": 0.3, "kappa": 1.0, "beta": 2.0}],
     ids=["paper", "narrow"],
 )
 def test_unscented_filter_equals_filterpy(
-    grid: str, process: str, points: dict[str, float]
+    grid: str, process: str, form: str, points: dict[str, float]
 ) -> None:
     b = still(grid)
-    made = b.filter(process=process, points=Scaling(**points))
+    made = b.filter(process=process, form=form, points=Scaling(**points))
     n, m = len(b.start), len(b.layout)
     merwe = MerweScaledSigmaPoints(n, points["alpha"], points["beta"], points["kappa"])
     peer = UnscentedKalmanFilter(n, m, 1.0, made.model.h, lambda x, dt: x, merwe)

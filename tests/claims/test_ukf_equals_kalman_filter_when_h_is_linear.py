@@ -23,6 +23,12 @@ CHOICES = {
     "fixed": ("ukf", Composition()),
     "narrow": ("ukf", Composition(points=Scaling(alpha=0.1, kappa=1.0))),
     "cubature": ("ukf", Composition(points=Scaling(beta=0.0))),
+    "square_root": ("ukf", Composition(form="square_root")),
+    "square_root_trend": ("ukf", Composition(form="square_root", process="local_trend")),
+    "square_root_per_channel": (
+        "ukf",
+        Composition(form="square_root", robustness="per_channel"),
+    ),
     "moments": ("ukf", Composition(scaling="moments")),
     "likelihood": ("ukf", Composition(scaling="likelihood")),
     "trace": ("ukf", Composition(robustness="trace")),
