@@ -48,7 +48,7 @@ def test_gross_errors_are_refused_one_by_one_and_nothing_else():
         eta, S = innovations(rng)
         bad = rng.choice(30, 3, replace=False)
         eta[bad] += 12.0 * rng.choice((-1.0, 1.0), 3)
-        found = refuse(eta, S)
+        found = refuse(eta, np.linalg.cholesky(S))
         missed += 3 - found[bad].sum()
         false += found.sum() - found[bad].sum()
     assert missed <= 0.02 * 600
@@ -61,7 +61,7 @@ def test_a_common_movement_is_not_refused():
     values, vectors = np.linalg.eigh(S)
     moved = eta + 3.5 * np.sqrt(values[-1]) * vectors[:, -1]
     assert (np.abs(moved) > 4).any()
-    assert not screening.refuse()(moved, S).any()
+    assert not screening.refuse()(moved, np.linalg.cholesky(S)).any()
 
 
 def test_first_refusal_is_the_largest_normalised_residual():
@@ -71,14 +71,21 @@ def test_first_refusal_is_the_largest_normalised_residual():
     inverse = np.linalg.inv(S)
     largest = np.argmax(np.abs(inverse @ eta) / np.sqrt(np.diagonal(inverse)))
     assert largest == 7
-    found = screening.refuse(InnovationParams(factor=4.0, largest_share=0.04))(eta, S)
+    found = screening.refuse(InnovationParams(factor=4.0, largest_share=0.04))(
+        eta, np.linalg.cholesky(S)
+    )
     np.testing.assert_array_equal(np.flatnonzero(found), [7])
 
 
 def test_more_than_a_share_is_never_refused():
     rng = np.random.default_rng(SEED)
     eta, S = innovations(rng)
-    assert screening.refuse(InnovationParams(largest_share=0.2))(1e3 * eta, S).sum() <= 6
+    assert (
+        screening.refuse(InnovationParams(largest_share=0.2))(
+            1e3 * eta, np.linalg.cholesky(S)
+        ).sum()
+        <= 6
+    )
 
 
 @cache
@@ -124,9 +131,10 @@ def test_replaced_samples_are_used_with_a_larger_sigma():
     done, _ = estimated("scaled", spiked=True)
     rows = spiked_rows(done.residuals)
     found = (rows["reasons"] & int(Reason.INCREMENT)).astype(bool)
-    assert found.sum() >= 5
+    assert found.all()
     assert rows["used"].all()
-    np.testing.assert_allclose(rows["inflation"][found], 8.0)
+    # 6 % of |V| is 11σ, and the σ of the replacement reaches as far.
+    assert (rows["inflation"] > 8.0**2 - 1.0).all()
 
 
 def test_adaptive_threshold_undoes_most_of_what_bad_data_cost():
@@ -152,7 +160,7 @@ def test_an_adaptive_threshold_stands_before_any_estimator():
     raw, aligned = telemetry(True)
     done = estimate(aligned, raw.channels, feeder(), STUDY, Method("m", "wls", screening="scaled"))
     found = spiked_rows(done.residuals)["reasons"] & int(Reason.INCREMENT)
-    assert (found > 0).sum() >= 5
+    assert (found > 0).all()
 
 
 def test_screening_by_innovation_is_for_the_kalman_filter():

@@ -8,12 +8,20 @@ Three thresholds:
 ``absolute``
     The same with |z̄|.
 ``scaled``
-    ξ = c max(σ_e √(1 + x'(X'X)⁻¹x), 1.4826 median |r|) on the residual r of a line through the last
-    four values; the root is 1.58 for that design.
+    ξ = c max(σ_e √(1 + x'(X'X)⁻¹x), 1.4826 median |r|, tail |r|) on the residual r of a local
+    forecast: the mean of the last four values, the last one, or their line, whichever served the
+    channel best of late. The root is 1.12, 1.41 or 1.58. The tail is what keeps channels that jump
+    by themselves: the residual that they exceed as rarely as a normal law exceeds c σ, over c.
 
 What is flagged is replaced by the weighted mean of the window, eq. (24), and the replacement enters
-the window. On a ramp that would latch a channel to old values for ever, so a run of more than
-``release`` flagged samples that agree with each other becomes the window.
+the window. Behind ``scaled`` its σ is at least its distance from the sample: as far as the channel
+alone can tell the truth lies between the two, so that a false alarm costs about as much as a
+missing sample.
+
+On a ramp the window would latch a channel to old values for ever, so a run of more than ``release``
+flagged samples that agree with each other becomes the window, and one of twice that length whether
+they agree or not. What is flagged is not learnt from, unless the next sample deviates to the same
+side: then the channel moved.
 
 A step is a function of a state and one sample per channel; many at once are the same steps.
 """
@@ -27,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.validation import tails
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -34,18 +43,22 @@ BoolArray = npt.NDArray[np.bool_]
 
 Threshold = Literal["literal", "absolute", "scaled"]
 
-LINE = 4
-"""Values that the local line runs through."""
-_AHEAD = np.array([-0.5, 0.0, 0.5, 1.0])
-"""Weights of the last four values in the value that their line predicts next."""
-SPREAD_OF_LINE = float(np.sqrt(1.0 + _AHEAD @ _AHEAD))
-"""√(1 + x'(X'X)⁻¹x) of that prediction, 1.58."""
-MEMORY = 60
-"""Residuals that the median is taken of."""
-FEWEST = 6
-"""Residuals below which there is no median, and the meter's own σ is all there is."""
-MAD = 1.4826
-"""σ of a normal law over its median absolute deviation."""
+SPAN = 4
+"""Values that a local forecast rests on."""
+AHEAD = np.array([[-0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 0.0, 1.0], [0.25, 0.25, 0.25, 0.25]])
+"""Weights of the last four values in the next one: on their line, as the last one, as their mean.
+
+√(1 + Σ w²) is √(1 + x'(X'X)⁻¹x) of the designs. (3, SPAN)
+"""
+RATE = 1 / 20
+"""Weight of the newest residual in how well each forecast served."""
+MEMORY = 288
+"""Residuals that quantiles are taken of: a day of five-minute steps has calm hours and others."""
+RENEWAL = 8
+"""Residuals after which the quantiles are taken again; so few hardly move them.
+
+Before the first of these times the meter's own σ is all there is.
+"""
 
 
 @dataclass(frozen=True)
@@ -64,7 +77,7 @@ class AdaptiveParams:
     release : int
         A longer run of flagged samples that agree with each other is accepted.
     sigma_factor : float
-        σ of a replacement over that of a sample.
+        σ of a replacement over that of a sample, at least.
     """
 
     threshold: Threshold = "scaled"
@@ -82,8 +95,8 @@ class AdaptiveParams:
                 "adaptive: expected factor > 0, 0 < decay ≤ 1 and sigma_factor ≥ 1, received "
                 f"{self.factor}, {self.decay} and {self.sigma_factor}"
             )
-        if self.release < LINE:
-            raise ParameterError(f"adaptive: expected release ≥ {LINE}, received {self.release}")
+        if self.release <= SPAN:
+            raise ParameterError(f"adaptive: expected release > {SPAN}, received {self.release}")
 
 
 class AdaptiveState(NamedTuple):
@@ -93,17 +106,35 @@ class AdaptiveState(NamedTuple):
     ----------
     values : (L, m) ndarray
         Accepted and replaced values.
-    residuals : (MEMORY, m) ndarray
-        |r| of accepted samples about their local line.
+    sigmas : (SPAN, m) ndarray
+        σ_e of the last samples.
+    scores : (3, m) ndarray
+        Mean |r| of every forecast of late.
+    recent : (m, RENEWAL) ndarray
+        |r| that were learnt since the last renewal.
+    residuals : (m, MEMORY / RENEWAL, RENEWAL) ndarray
+        Those before, the newest written over the oldest; inf where there is none yet.
+    learnt : (m,) ndarray of int
+        How many were.
+    scale : (m,) ndarray
+        That of the residuals by body and tail, as of the last renewal.
     suspects : (release + 1, m) ndarray
         Raw values of the present run of flagged samples.
+    deviation : (m,) ndarray
+        Signed residual of the newest of them.
     run, releases : (m,) ndarray of int
         Length of the run, and how often one was accepted.
     """
 
     values: FloatArray
+    sigmas: FloatArray
+    scores: FloatArray
+    recent: FloatArray
     residuals: FloatArray
+    learnt: IntArray
+    scale: FloatArray
     suspects: FloatArray
+    deviation: FloatArray
     run: IntArray
     releases: IntArray
 
@@ -111,9 +142,15 @@ class AdaptiveState(NamedTuple):
     def empty(cls, m: int, params: AdaptiveParams) -> AdaptiveState:
         """State of m channels of which nothing is known."""
         return cls(
-            np.full((max(params.window - 1, LINE), m), np.nan),
-            np.full((MEMORY, m), np.nan),
+            np.full((max(params.window - 1, SPAN), m), np.nan),
+            np.full((SPAN, m), np.nan),
+            np.zeros((len(AHEAD), m)),
+            np.full((m, RENEWAL), np.inf),
+            np.full((m, MEMORY // RENEWAL, RENEWAL), np.inf),
+            np.zeros(m, dtype=np.int64),
+            np.zeros(m),
             np.full((params.release + 1, m), np.nan),
+            np.zeros(m),
             np.zeros(m, dtype=np.int64),
             np.zeros(m, dtype=np.int64),
         )
@@ -167,51 +204,58 @@ def step(
     state : AdaptiveState
     decision : Decision
     """
+    channel = np.arange(len(z))
     z_near = _near(z, state.values[-1], turn)
-    forecast = _weighted(_AHEAD, state.values[-LINE:])
-    residual = np.abs(z_near - forecast)
-    noise = SPREAD_OF_LINE * sigma
-    known = np.isfinite(state.residuals).sum(axis=0)
-    typical = MAD * _median(state.residuals, known)
-    scaled = params.factor * np.maximum(noise, np.where(known >= FEWEST, typical, 0.0))
+    deviations = z_near - (AHEAD[:, :, None] * state.values[-SPAN:]).sum(axis=1)
+    served = state.scores.argmin(axis=0)
+    deviation = deviations[served, channel]
+    residual = np.abs(deviation)
+    # Samples of one channel may differ in σ: σ_e² (1 + x'(X'X)⁻¹x) is then this sum.
+    noise = np.sqrt(sigma**2 + ((AHEAD[served].T * state.sigmas) ** 2).sum(axis=0))
+    scaled = params.factor * np.maximum(noise, state.scale)
     if params.threshold == "scaled":
-        statistic, threshold = residual, np.where(np.isfinite(forecast), scaled, np.nan)
+        statistic, threshold = residual, np.where(np.isfinite(residual), scaled, np.nan)
     else:
         statistic, threshold = _printed(state.values, z_near, sigma, params)
     suspicious = present & (statistic > threshold)
 
-    weight = params.decay ** np.arange(params.window - 1)[::-1]
-    past = state.values[-(params.window - 1) :]
-    replacement = _weighted(weight, past) / weight.sum()
-
-    suspects = state.suspects
+    accepted, value, wide = z_near, z, sigma
+    suspects, run = state.suspects, np.where(present, 0, state.run)
+    flagged = released = suspicious
     if suspicious.any():
         suspects = _pushed(suspects, z_near, suspicious)
-    run = np.where(present, np.where(suspicious, state.run + 1, 0), state.run)
-    released = suspicious & (run > params.release)
-    if released.any():
-        released &= _agree(suspects, scaled)
-    flagged = suspicious & ~released
+        run = np.where(suspicious, state.run + 1, run)
+        released = suspicious & (run > params.release)
+        if released.any():
+            released &= _agree(suspects, scaled) | (run > 2 * params.release)
+        flagged = suspicious & ~released
+        replacement, least = _replacement(state.values, z_near, sigma, params)
+        accepted, value = np.where(flagged, replacement, z_near), np.where(flagged, replacement, z)
+        wide = np.where(flagged, least, sigma)
 
-    values = _pushed(state.values, np.where(flagged, replacement, z_near), present)
+    known = present & np.isfinite(residual)
+    values = _pushed(state.values, accepted, present)
+    scores = state.scores + np.where(known, RATE * (np.abs(deviations) - state.scores), 0.0)
     if released.any():
         values[:, released] = suspects[-len(values) :, released]
-    good = present & ~suspicious & np.isfinite(residual)
+        scores[:, released] = _tried(suspects[:, released])
+    recent, residuals, learnt, scale = _learn(
+        state, z_near, deviation, known, suspicious, run, params.factor
+    )
     following = AdaptiveState(
         values,
-        _pushed(state.residuals, residual, good),
+        _pushed(state.sigmas, sigma, present),
+        scores,
+        recent,
+        residuals,
+        learnt,
+        scale,
         suspects,
+        np.where(suspicious, deviation, state.deviation),
         np.where(released, 0, run),
         state.releases + released,
     )
-    return following, Decision(
-        flagged,
-        released,
-        np.where(flagged, replacement, z),
-        np.where(flagged, params.sigma_factor * sigma, sigma),
-        statistic,
-        threshold,
-    )
+    return following, Decision(flagged, released, value, wide, statistic, threshold)
 
 
 def screen(
@@ -291,13 +335,61 @@ def _pushed(past: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
     return out
 
 
-def _median(past: FloatArray, known: IntArray) -> FloatArray:
-    """Median of the finite entries of each column, 0 without any."""
-    ordered = np.sort(past, axis=0)  # NaN last
-    middle = np.maximum(known - 1, 0) / 2.0
-    column = np.arange(past.shape[1])
-    low, high = np.floor(middle).astype(np.int64), np.ceil(middle).astype(np.int64)
-    return np.nan_to_num(0.5 * (ordered[low, column] + ordered[high, column]))
+def _replacement(
+    values: FloatArray, z: FloatArray, sigma: FloatArray, params: AdaptiveParams
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted mean of the window, eq. (24), and its σ."""
+    weight = params.decay ** np.arange(params.window - 1)[::-1]
+    replacement = _weighted(weight, values[-(params.window - 1) :]) / weight.sum()
+    wide = params.sigma_factor * sigma
+    if params.threshold == "scaled":
+        wide = np.maximum(wide, np.abs(z - replacement))
+    return replacement, wide
+
+
+def _learn(
+    state: AdaptiveState,
+    z: FloatArray,
+    deviation: FloatArray,
+    known: BoolArray,
+    suspicious: BoolArray,
+    run: IntArray,
+    factor: float,
+) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+    """Recent and older residuals, their number and scale after a sample.
+
+    If only accepted residuals were learnt, a channel that begins to move would never be told so. A
+    flagged one counts if the next deviates to the same side, by the smaller of the two, and from
+    then on by the steps within the run. Independent errors do that once in a while (at a share q in
+    q²/2 of all samples), which leaves the quantiles where they are.
+    """
+    residual, learns = np.abs(deviation), known & ~suspicious
+    if suspicious.any():
+        moved = suspicious & (run >= 2) & (deviation * state.deviation > 0)
+        first = np.minimum(residual, np.abs(state.deviation))
+        size = np.where(run == 2, first, np.abs(z - state.suspects[-1]))
+        residual, learns = np.where(moved, size, residual), learns | moved
+    at = np.flatnonzero(learns)
+    recent, residuals, scale = state.recent.copy(), state.residuals, state.scale
+    recent[at, state.learnt[at] % RENEWAL] = residual[at]
+    learnt = state.learnt + learns
+    full = at[learnt[at] % RENEWAL == 0]
+    if len(full):
+        residuals, scale = residuals.copy(), scale.copy()
+        block = (learnt[full] // RENEWAL - 1) % residuals.shape[1]
+        residuals[full, block] = recent[full]
+        count = np.minimum(learnt[full], MEMORY)
+        scale[full] = tails.scale(residuals[full].reshape(len(full), MEMORY), count, factor)
+    return recent, residuals, learnt, scale
+
+
+def _tried(suspects: FloatArray) -> FloatArray:
+    """Mean |r| of every forecast along a run of values."""
+    ahead = [
+        np.abs(suspects[k] - (AHEAD[:, :, None] * suspects[k - SPAN : k]).sum(axis=1))
+        for k in range(SPAN, len(suspects))
+    ]
+    return np.asarray(np.mean(ahead, axis=0))
 
 
 def _agree(suspects: FloatArray, bound: FloatArray) -> BoolArray:
