@@ -8,7 +8,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.kalman import KalmanState, kalman_filter, predict, update
+from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.process import LoadStatistics, load_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
@@ -16,27 +16,6 @@ from pse_analysis.measurement import BUS, FROM, IA, IM, VA, VM, MeasurementModel
 
 SEED = 20
 STEPS = 20
-
-
-def test_predict_and_update_equal_filterpy() -> None:
-    rng = np.random.default_rng(SEED)
-    n, m = 28, 40
-    half = rng.normal(size=(n, n))
-    peer = KalmanFilter(dim_x=n, dim_z=m)
-    peer.x, peer.P = rng.normal(size=n), half @ half.T / n + np.eye(n)
-    peer.F, peer.Q = np.eye(n), 0.01 * np.eye(n)
-    noise = rng.normal(size=(m, m))
-    peer.H, peer.R = rng.normal(size=(m, n)), noise @ noise.T / m + 0.5 * np.eye(m)
-    ours = KalmanState(peer.x.copy(), peer.P.copy())
-    for _ in range(STEPS):
-        z = rng.normal(size=m)
-        peer.predict()
-        peer.update(z)
-        ours, innovation, _, nis = update(predict(ours, peer.Q), peer.H, z, peer.R)
-        np.testing.assert_allclose(ours.x, peer.x, atol=1e-9)
-        np.testing.assert_allclose(ours.P, peer.P, atol=1e-9)
-        np.testing.assert_allclose(innovation, peer.y, atol=1e-9)
-        assert abs(nis - peer.mahalanobis**2) < 1e-6
 
 
 def test_estimator_on_phasors_equals_filterpy_on_their_rectangular_form() -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from reference import kalman_step
 
 from pse_analysis.estimation.estimator import Snapshot
+from pse_analysis.estimation.holt import Process, holt, local_trend, random_walk
 from pse_analysis.estimation.intervals import bridge_covariance, weights
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.process import LoadStatistics, load_noise
@@ -28,7 +30,11 @@ SEED = 5
 STEP_S = 300.0
 
 
-def test_lagged_filter_equals_augmented_textbook_filter() -> None:
+@pytest.mark.parametrize(
+    "process", [random_walk(), holt(), local_trend()], ids=["walk", "holt", "trend"]
+)
+def test_lagged_filter_equals_augmented_textbook_filter(process: Process) -> None:
+    """The textbook's state keeps one instant more: it holds what it reads while it updates."""
     network = library.load("ieee14")
     n, bus = network.n_bus, np.arange(network.n_bus)
     layout = SensorLayout.of(
@@ -42,7 +48,12 @@ def test_lagged_filter_equals_augmented_textbook_filter() -> None:
     statistics = LoadStatistics(0.01 * nominal[None, :] + 1e-4, np.eye(2 * n), 3e-4, 86400.0)
     noise = load_noise(network, statistics)
     lags = 4
-    ours = kalman_filter("kf", network, layout, noise, step_s=STEP_S, reach_s=1200.0)
+    ours = kalman_filter(
+        "kf", network, layout, noise, step_s=STEP_S, reach_s=1200.0, process=process
+    )
+    wide = kalman_filter(
+        "kf", network, layout, noise, step_s=STEP_S, reach_s=1500.0, process=process
+    )
     linear = RectangularModel(network, layout)
     exact = MeasurementModel(network, layout).h(solve(network).x)
     rng = np.random.default_rng(SEED)
@@ -55,27 +66,44 @@ def test_lagged_filter_equals_augmented_textbook_filter() -> None:
         time = np.datetime64("2016-06-09T00:00:00", "us") + k * np.timedelta64(300, "s")
         return Snapshot(time, z, sigma, np.zeros(len(sigma)), available, fresh, age)
 
-    state, _ = ours.init(snapshot(0))
-    size = 2 * n * (lags + 1)
-    assert state.x.shape == (size,)
-    x, covariance = state.x.copy(), state.P.copy()
-    F = np.eye(size, k=-2 * n)
-    F[: 2 * n, : 2 * n] = np.eye(2 * n)
+    first = snapshot(0)
+    state, start = ours.init(first)[0], wide.init(first)[0]
+    m, order = 2 * n, process.order
+    size = m * (lags + order)
+    assert state.x.shape == (size - m,)
+    x, covariance = start.x.copy(), start.P.copy()
+    now_to_next = process.transition
+    F = np.eye(size, k=-m)
+    F[m * (lags + 1) :] = 0.0
+    head = [0, lags + 1][:order]
+    for i, to in enumerate(head):
+        for j, come in enumerate(head):
+            F[m * to : m * (to + 1), m * come : m * (come + 1)] = now_to_next[i, j] * np.eye(m)
+    memory = start.process
+    kept = np.arange(size).reshape(-1, m)[[*range(lags), *head[1:]]].ravel()
+    present = np.arange(size).reshape(-1, m)[head].ravel()
     for k in range(1, 13):
         now = snapshot(k)
-        voltage = x[:n] + 1j * x[n : 2 * n]
+        ahead, _, memory = process.forecast(
+            x[present], covariance[np.ix_(present, present)], memory
+        )
+        offset = np.zeros(size)
+        offset[present] = ahead - (F @ x)[present]
+        voltage = ahead[:n] + 1j * ahead[n : 2 * n]
         walk = np.zeros((size, size))
-        walk[: 2 * n, : 2 * n] = noise(voltage, now.time)
+        walk[np.ix_(present, present)] = process.noise(noise(voltage, now.time))
         used = np.flatnonzero(now.available & now.fresh)
         interval = now.age_s[used], layout.window_s[used], STEP_S, lags
         share, bridge = weights(*interval), bridge_covariance(*interval)
         for _ in range(3):
             H, z, spread = linear.rows(now.z, sigma, now.available & now.fresh, voltage)
             H = H.toarray()[used]
-            lagged = np.hstack([share[:, [lag]] * H for lag in range(lags + 1)])
-            moved = H @ walk[: 2 * n, : 2 * n] @ H.T
-            R = np.diag(spread[used] ** 2) + bridge * moved
-            after = kalman_step(x, covariance, F, walk, lagged, R, z[used])
+            slopes = np.zeros((len(used), m * (order - 1)))
+            lagged = np.hstack([*(share[:, [lag]] * H for lag in range(lags + 1)), slopes])
+            R = np.diag(spread[used] ** 2) + bridge * (H @ walk[:m, :m] @ H.T)
+            moved = z[used] - lagged @ offset
+            after = kalman_step(x, covariance, F, walk, lagged, R, moved)
+            after = after[0] + offset, after[1]
             reached = after[0][:n] + 1j * after[0][n : 2 * n]
             settled = np.abs(reached - voltage).max() < 1e-3
             voltage = reached
@@ -84,6 +112,8 @@ def test_lagged_filter_equals_augmented_textbook_filter() -> None:
         x, covariance = after
         state, info = ours.step(state, now)
         assert info.used.sum() == len(used)
-        np.testing.assert_allclose(state.x, x, atol=1e-9)
-        np.testing.assert_allclose(state.P, covariance, atol=1e-9)
-    assert np.abs(state.x[: 2 * n] - state.x[-2 * n :]).max() > 1e-4
+        np.testing.assert_allclose(state.x, x[kept], rtol=1e-9, atol=1e-11)
+        deviation = np.sqrt(np.maximum(np.diagonal(covariance)[kept], 1e-20))
+        difference = (state.P - covariance[np.ix_(kept, kept)]) / np.outer(deviation, deviation)
+        assert np.abs(difference).max() < 1e-8
+    assert np.abs(state.x[:m] - state.x[m * (lags - 1) : m * lags]).max() > 1e-4

@@ -6,17 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from reference import kalman_step
 
 from pse_analysis.estimation.estimator import Estimator, Snapshot
-from pse_analysis.estimation.kalman import (
-    KalmanState,
-    kalman_filter,
-    predict,
-    update,
-)
+from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import scalar_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
@@ -26,76 +18,6 @@ from pse_analysis.vocabulary import Status
 
 SEED = 33
 STEP_S = 300.0
-
-
-def covariance(n: int, rng: np.random.Generator) -> np.ndarray:
-    half = rng.normal(size=(n, n))
-    return np.asarray(half @ half.T + 0.1 * np.eye(n))
-
-
-def random_filter(
-    n: int, m: int, rng: np.random.Generator
-) -> tuple[KalmanState, np.ndarray, np.ndarray, np.ndarray]:
-    return (
-        KalmanState(rng.normal(size=n), covariance(n, rng)),
-        rng.normal(size=(m, n)),
-        rng.normal(size=m),
-        covariance(m, rng),
-    )
-
-
-@settings(max_examples=20, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 8), m=st.integers(1, 10))
-def test_update_equals_the_textbook(seed: int, n: int, m: int) -> None:
-    rng = np.random.default_rng(seed)
-    state, H, z, R = random_filter(n, m, rng)
-    after, innovation, deviation, nis = update(state, H, z, R)
-    x, P_after = kalman_step(state.x, state.P, np.eye(n), np.zeros((n, n)), H, R, z)
-    np.testing.assert_allclose(after.x, x, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(after.P, P_after, rtol=1e-8, atol=1e-8)
-    S = H @ state.P @ H.T + R
-    np.testing.assert_allclose(innovation, z - H @ state.x)
-    np.testing.assert_allclose(deviation**2, np.diagonal(S))
-    assert nis == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-8)
-
-
-def test_rows_one_by_one_equal_rows_together() -> None:
-    state, H, z, R = random_filter(6, 4, np.random.default_rng(SEED))
-    R = np.diag(np.diagonal(R))
-    together = update(state, H, z, R)
-    nis = 0.0
-    for i in range(4):
-        state, _, _, part = update(state, H[[i]], z[[i]], R[[i]][:, [i]])
-        nis += part
-    np.testing.assert_allclose(state.x, together[0].x, atol=1e-10)
-    np.testing.assert_allclose(state.P, together[0].P, atol=1e-10)
-    assert nis == pytest.approx(together[3])
-
-
-def test_prediction_moves_the_past_back_by_one() -> None:
-    rng = np.random.default_rng(SEED)
-    state = random_filter(9, 1, rng)[0]
-    noise = np.diag([1.0, 2.0, 3.0])
-    after = predict(state, noise)
-    F = np.zeros((9, 9))
-    F[:3, :3] = F[3:6, :3] = F[6:, 3:6] = np.eye(3)
-    full = np.zeros((9, 9))
-    full[:3, :3] = noise
-    np.testing.assert_allclose(after.x, F @ state.x)
-    np.testing.assert_allclose(after.P, F @ state.P @ F.T + full)
-
-
-def test_covariance_stays_symmetric_and_positive_over_many_steps() -> None:
-    rng = np.random.default_rng(SEED)
-    state, _, _, _ = random_filter(12, 1, rng)
-    for _ in range(500):
-        _, H, z, R = random_filter(12, 5, rng)
-        state = update(predict(state, 1e-6 * np.eye(6)), H, z, R)[0]
-    np.testing.assert_array_equal(state.P, state.P.T)
-    assert np.linalg.eigvalsh(state.P).min() > 0
-
-
-# --- the whole filter -----------------------------------------------------------------------------
 
 
 def metered(network: Network) -> SensorLayout:
@@ -200,7 +122,7 @@ def test_sample_that_is_older_than_what_is_kept_is_left_out() -> None:
 
 
 def test_older_states_spread_by_the_walk_at_the_start() -> None:
-    b = bench(reach_s=600.0, q=1e-6)
+    b = bench(reach_s=900.0, q=1e-6)
     state, _ = b.filter.init(b.snapshot(0))
     n = 2 * b.network.n_bus
     assert state.P.shape == (3 * n, 3 * n)

@@ -22,6 +22,17 @@ def covered(age_s: FloatArray, window_s: FloatArray, step_s: float, lags: int) -
     return np.asarray((age_s + window_s) / step_s <= lags + 1e-9)
 
 
+def kinds(
+    age_s: FloatArray, window_s: FloatArray
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
+    """Distinct pairs of age and window, (κ,) each, and which of them every sample has, (m,).
+
+    Samples of one device, and of all meters of a kind, share their interval.
+    """
+    found, kind = np.unique(age_s + 1j * window_s, return_inverse=True)
+    return found.real, found.imag, kind
+
+
 def weights(age_s: FloatArray, window_s: FloatArray, step_s: float, lags: int) -> FloatArray:
     """Weights with which samples read the instants.
 
@@ -40,18 +51,21 @@ def weights(age_s: FloatArray, window_s: FloatArray, step_s: float, lags: int) -
     (m, K+1) ndarray
         For the present, one step ago, …; rows of samples that `covered` accepts sum to 1.
     """
-    near = np.asarray(age_s)[:, None] / step_s
-    width = np.asarray(window_s)[:, None] / step_s
     lag = np.arange(lags + 1)
-    hat = np.maximum(0.0, 1.0 - np.abs(near - lag))
-    mean = _hat_integral(near + width - lag) - _hat_integral(near - lag)
-    return np.where(width > 0, mean / np.where(width > 0, width, 1.0), hat)
+    near = np.asarray(age_s)[:, None] / step_s - lag
+    width = np.asarray(window_s)[:, None] / step_s
+    passed = _hat_integral(np.stack([near + width, near]))
+    mean = passed[0] - passed[1]
+    lasting = width > 0
+    mean /= np.where(lasting, width, 1.0)
+    return np.where(lasting, mean, np.maximum(0.0, 1.0 - np.abs(near)))
 
 
 def _hat_integral(u: FloatArray) -> FloatArray:
     """∫ max(0, 1-|v|) dv from -∞ to u."""
-    u = np.clip(u, -1.0, 1.0)
-    return np.where(u < 0, 0.5 * (1 + u) ** 2, 1.0 - 0.5 * (1 - u) ** 2)
+    rest = 1.0 - np.minimum(np.abs(u), 1.0)
+    tail = 0.5 * rest * rest
+    return np.where(u < 0, tail, 1.0 - tail)
 
 
 def bridge_covariance(
@@ -77,27 +91,18 @@ def bridge_covariance(
     """
     near = np.asarray(age_s) / step_s
     width = np.maximum(np.asarray(window_s) / step_s, _INSTANT)
-    # Samples of one device, and of all meters of a kind, share their interval.
-    kinds, kind = np.unique(np.stack([near, width]), axis=1, return_inverse=True)
-    near, width = kinds
-    among = np.zeros((len(near), len(near)))
-    for step in range(lags):
-        begin = np.clip(near - step, 0.0, 1.0)
-        end = np.clip(near + width - step, 0.0, 1.0)
-        area = (
-            _min_integral(end[:, None], end)
-            - _min_integral(begin[:, None], end)
-            - _min_integral(end[:, None], begin)
-            + _min_integral(begin[:, None], begin)
-        )
-        square = 0.5 * (end**2 - begin**2)
-        among += area - np.outer(square, square)
-    among /= np.outer(width, width)
-    kind = np.ravel(kind)
-    return np.asarray(among[np.ix_(kind, kind)])
+    step = np.arange(lags)[:, None]
+    begin, end = np.clip(near - step, 0.0, 1.0), np.clip(near + width - step, 0.0, 1.0)
+    k = len(near)
+    area = _min_integral(np.concatenate([end, begin], axis=1))
+    square = 0.5 * (end * end - begin * begin)
+    common = area[:, :k, :k] - area[:, k:, :k] - area[:, :k, k:] + area[:, k:, k:]
+    common -= square[:, :, None] * square[:, None, :]
+    return np.asarray(common.sum(axis=0) / np.outer(width, width))
 
 
-def _min_integral(x: FloatArray, y: FloatArray) -> FloatArray:
-    """∫₀ˣ∫₀ʸ min(u, v) dv du."""
-    low, high = np.minimum(x, y), np.maximum(x, y)
-    return np.asarray(0.5 * low**2 * high - low**3 / 6.0)
+def _min_integral(x: FloatArray) -> FloatArray:
+    """∫∫ min(u, v) dv du from 0 to every x and from 0 to every other of its row."""
+    low = np.minimum(x[:, :, None], x[:, None, :])
+    high = np.maximum(x[:, :, None], x[:, None, :])
+    return np.asarray(low * low * (0.5 * high - low / 6.0))

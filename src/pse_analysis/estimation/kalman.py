@@ -1,7 +1,7 @@
 """Kalman filter on the linear rectangular model, with the recent past in its state.
 
 A sample is rarely taken at the instant it is used at: a meter reports the mean of the last quarter
-of an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last K
+of an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last
 instants beside the present one, and reads a sample through the weights with which its interval
 covers them (`pse_analysis.estimation.intervals`). So a sample enters once, where it belongs.
 """
@@ -9,13 +9,23 @@ covers them (`pse_analysis.estimation.intervals`). So a sample enters once, wher
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, sparse
+from scipy.linalg import blas, lapack
 
-from pse_analysis.estimation import intervals
+from pse_analysis.estimation import holt, intervals
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.lagged import (
+    Belief,
+    Expected,
+    Functionals,
+    Lagged,
+    Reach,
+    less,
+    turned,
+)
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
 from pse_analysis.estimation.screening import Refuse
 from pse_analysis.estimation.start import begin
@@ -32,6 +42,8 @@ IntArray = npt.NDArray[np.int64]
 REFINE_PU = 1e-3
 """The measurements are transformed again if an update moves a voltage by more than this. [p.u.]"""
 MAX_PASSES = 3
+PATTERNS = 256
+"""Sets of functionals of which the rows are kept: the same channels report again and again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,67 +52,198 @@ class KalmanState:
 
     Attributes
     ----------
-    x : ((K+1)·2N,) ndarray
-        [e; f] now, one step ago, …, K steps ago. [p.u.]
-    P : ((K+1)·2N, (K+1)·2N) ndarray
+    x : (B·2N,) ndarray
+        [e; f] now, one step ago, …, K-1 steps ago, and slopes if the process has any; at the next
+        instant these are up to K steps old. [p.u.]
+    P : (B·2N, B·2N) ndarray
         Its covariance.
+    process : object
+        Memory of the process.
     """
 
     x: FloatArray
     P: FloatArray
+    process: Any = None
 
 
-def predict(state: KalmanState, noise: FloatArray) -> KalmanState:
-    """One step of the random walk: the present gets Q, every older state moves back by one."""
-    n = noise.shape[0]
-    source = np.concatenate([np.arange(n), np.arange(len(state.x) - n)])
-    x = state.x[source]
-    covariance = state.P[np.ix_(source, source)]
-    covariance[:n, :n] += noise
-    return KalmanState(x, covariance)
+class _Readings(NamedTuple):
+    """What rows read of the state, whatever their frames.
 
-
-def update(
-    state: KalmanState, H: FloatArray | sparse.csr_array, z: FloatArray, R: FloatArray
-) -> tuple[KalmanState, FloatArray, FloatArray, float]:
-    """Condition on z = H x + v.
-
-    Parameters
+    Attributes
     ----------
-    state : KalmanState
-    H : (m, n) ndarray or csr_array
-    z : (m,) ndarray
-    R : (m, m) ndarray
-        Covariance of v.
-
-    Returns
-    -------
-    state : KalmanState
-    innovation : (m,) ndarray
-        η = z - H x.
-    sigma_innovation : (m,) ndarray
-        √S_ii.
-    nis : float
-        ηᵀS⁻¹η.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If S is not positive definite.
+    group : (r,) ndarray of int
+        Functional of each row; both halves of a phasor or power read the same one.
+    expected : Expected
+        Moments of the functionals.
     """
-    innovation = z - H @ state.x
-    HP = H @ state.P
-    S = HP @ H.T + R
-    chol_S = linalg.cholesky(S, lower=True, check_finite=False)
-    white = linalg.solve_triangular(chol_S, innovation, lower=True, check_finite=False)
-    # P - K S Kᵀ = P - WᵀW with W = chol(S)⁻¹ H P: one symmetric product.
-    W = linalg.solve_triangular(chol_S, HP, lower=True, check_finite=False)
-    return (
-        KalmanState(state.x + W.T @ white, state.P - W.T @ W),
-        innovation,
-        np.sqrt(np.diagonal(S)),
-        float(white @ white),
-    )
+
+    group: IntArray
+    expected: Expected
+
+
+class _Innovation(NamedTuple):
+    """η of rows at a voltage, with the lower Cholesky factor of S and L⁻¹η."""
+
+    turn: ComplexArray
+    eta: FloatArray
+    sigma: FloatArray
+    chol_S: FloatArray
+    white: FloatArray
+
+
+class KalmanFilter:
+    """A filter for one grid and sensor layout; `kalman_filter` tells what the parameters mean."""
+
+    def __init__(
+        self,
+        network: Network,
+        layout: SensorLayout,
+        noise: ProcessNoise,
+        *,
+        step_s: float,
+        lags: int,
+        instant: bool,
+        refuse: Refuse | None,
+        process: holt.Process,
+    ) -> None:
+        self.n_bus, self.layout = network.n_bus, layout
+        self.step_s, self.instant, self.refuse = step_s, instant, refuse
+        self.model = RectangularModel(network, layout)
+        self.lagged = Lagged(2 * network.n_bus, lags, process)
+        self._noise = noise
+        # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
+        self._held = None if layout.has_angle else network.n_bus + network.slack
+        self._first = np.where(
+            self.model.partner >= 0,
+            np.minimum(self.model.partner, np.arange(len(layout))),
+            np.arange(len(layout)),
+        )
+        self._patterns: dict[bytes, Functionals] = {}
+
+    def walk(self, x: FloatArray, time: np.datetime64) -> FloatArray:
+        """Q (2N, 2N) of the step to an instant, at a forecast."""
+        covariance = self._noise(self.voltage(x), time)
+        if self._held is not None:
+            covariance = covariance.copy()
+            covariance[self._held, :] = covariance[:, self._held] = 0.0
+        return covariance
+
+    def voltage(self, x: FloatArray) -> ComplexArray:
+        """Present voltage of a state. (N,)"""
+        n = self.n_bus
+        return np.asarray(x[:n] + 1j * x[n : 2 * n])
+
+    def begin(
+        self, voltage: ComplexArray, covariance: FloatArray, time: np.datetime64
+    ) -> KalmanState:
+        """State from a voltage and the covariance (2N, 2N) of its [e; f]."""
+        x = np.concatenate([voltage.real, voltage.imag])
+        return KalmanState(*self.lagged.begin(x, covariance, self.walk(x, time)))
+
+    def step(self, state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
+        """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
+        m = len(self.layout)
+        belief = Belief(state.x, state.P, state.process)
+        forecast = self.lagged.forecast(belief)
+        noise = self.lagged.process.noise(self.walk(forecast[0], snapshot.time))
+        prior = self.lagged.moved(belief, forecast, noise)
+        used, sigma = self._usable(snapshot)
+        if not used.any():
+            return KalmanState(*prior), Info.nothing(m, Status.PREDICTED)
+        rows = np.flatnonzero(used)
+        readings = self._read(belief, prior, noise, snapshot, rows)
+        frame = self.model.frame(snapshot.z, sigma, used, rows)
+        at = self.voltage(prior.x)
+        full = np.full((2, m), np.nan)
+        refused = np.zeros(m, dtype=bool)
+        try:
+            innovation = _innovation(readings, *frame.at(at))
+            if self.refuse is not None:
+                out = self.refuse(innovation.eta, innovation.chol_S)
+                if out.any():
+                    full[0, rows], full[1, rows] = innovation.eta, innovation.sigma
+                    full[:, rows[~out]] = np.nan
+                    refused[rows[out]] = True
+                    used = used & ~refused
+                    rows, readings = rows[~out], readings._replace(group=readings.group[~out])
+                    if not len(rows):
+                        return KalmanState(*prior), replace(
+                            Info.nothing(m, Status.PREDICTED),
+                            innovation=full[0],
+                            sigma_innovation=full[1],
+                            reasons=_refusals(refused),
+                        )
+                    frame = self.model.frame(snapshot.z, sigma, used, rows)
+                    innovation = _innovation(readings, *frame.at(at))
+            for passes in range(1, MAX_PASSES + 1):
+                x = prior.x + _gained(readings, innovation)
+                after = self.voltage(x)
+                if passes == MAX_PASSES or np.abs(after - at).max() < REFINE_PU:
+                    break
+                at = after
+                innovation = _innovation(readings, *frame.at(at))
+        except np.linalg.LinAlgError:
+            return None, Info.nothing(
+                m,
+                Status.DIVERGED,
+                "the innovation's covariance is not positive definite: the filter starts "
+                "again from least squares",
+            )
+        full[0, rows], full[1, rows] = innovation.eta, innovation.sigma
+        return KalmanState(x, _conditioned(prior.P, readings, innovation), prior.memory), Info(
+            Status.OK,
+            passes,
+            float(innovation.white @ innovation.white),
+            len(rows),
+            used,
+            full[0],
+            full[1],
+            np.zeros(m),
+            reasons=_refusals(refused),
+        )
+
+    def _usable(self, snapshot: Snapshot) -> tuple[BoolArray, FloatArray]:
+        """Rows that are used, and their σ."""
+        if self.instant:
+            return snapshot.available, snapshot.sigma
+        near = intervals.covered(
+            snapshot.age_s, self.layout.window_s, self.step_s, self.lagged.lags
+        )
+        own = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
+        return snapshot.available & snapshot.fresh & near, own
+
+    def _read(
+        self,
+        belief: Belief,
+        prior: Belief,
+        noise: FloatArray,
+        snapshot: Snapshot,
+        rows: IntArray,
+    ) -> _Readings:
+        """Moments of what some rows of a snapshot read."""
+        first = self._first[rows]
+        age, window = snapshot.age_s, self.layout.window_s
+        if not self.instant:
+            alike = (age[first] == age[rows]) & (window[first] == window[rows])
+            first = np.where(alike, first, rows)
+        wanted = np.zeros(len(self.layout), dtype=bool)
+        wanted[first] = True
+        number = np.cumsum(wanted) - 1
+        key = wanted.tobytes()
+        if key not in self._patterns:
+            if len(self._patterns) >= PATTERNS:
+                self._patterns.clear()
+            self._patterns[key] = Functionals(self.model.functionals[wanted])
+        functionals = self._patterns[key]
+        if self.instant:
+            reach = None
+        else:
+            ages, windows, kind = intervals.kinds(age[wanted], window[wanted])
+            between = ages, windows, self.step_s, self.lagged.lags
+            bridge = intervals.bridge_covariance(*between)
+            reach = Reach(intervals.weights(*between)[kind], bridge[kind[:, None], kind])
+        expected = self.lagged.expect(belief, prior, noise, functionals, reach)
+        return _Readings(number[first], expected)
 
 
 def kalman_filter(
@@ -113,8 +256,9 @@ def kalman_filter(
     reach_s: float = 0.0,
     instant: bool = False,
     refuse: Refuse | None = None,
+    process: holt.Process | None = None,
 ) -> Estimator:
-    """Kalman filter with F = I on the linear rectangular model.
+    """Kalman filter on the linear rectangular model.
 
     Parameters
     ----------
@@ -136,6 +280,8 @@ def kalman_filter(
     refuse : Refuse, optional
         Asked about the innovation before every update; rows that it names are left out, and stand
         in the info with their innovation.
+    process : Process, optional
+        How the mean moves; F = I if not given.
 
     Returns
     -------
@@ -146,143 +292,88 @@ def kalman_filter(
     Notes
     -----
     Eqs. (25)–(29) of [qi2025] with constant H where all samples are instantaneous and of
-    age 0.
+    age 0. Functionals of the state are constant, and a predicted voltage only turns and scales the
+    rows in which they are read: their covariance is made once per step, however often the
+    measurements are transformed again.
     """
-    model = RectangularModel(network, layout)
-    wls = WeightedLeastSquares(network, layout)
-    n2 = 2 * network.n_bus
     lags = 0 if instant else int(np.ceil(reach_s / step_s - 1e-9))
-    # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
-    held = None if layout.has_angle else network.n_bus + network.slack
-
-    def process(voltage: ComplexArray, time: np.datetime64) -> FloatArray:
-        covariance = noise(voltage, time)
-        if held is not None:
-            covariance = covariance.copy()
-            covariance[held, :] = covariance[:, held] = 0.0
-        return covariance
+    made = KalmanFilter(
+        network,
+        layout,
+        noise,
+        step_s=step_s,
+        lags=lags,
+        instant=instant,
+        refuse=refuse,
+        process=process or holt.random_walk(),
+    )
+    wls = WeightedLeastSquares(network, layout)
+    n = network.n_bus
 
     def init(snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
         solution, info = begin(wls, snapshot)
         if solution is None:
             return None, info
-        n = network.n_bus
         voltage = solution.x[n:] * np.exp(1j * solution.x[:n])
         turn = to_rectangular(voltage)
-        start = turn @ solution.covariance() @ turn.T
-        walk = process(voltage, snapshot.time)
-        # Backwards the random walk spreads again: Cov(x₋ⱼ, x₋ₖ) = P₀ + min(j, k) Q.
-        older = np.minimum.outer(np.arange(lags + 1), np.arange(lags + 1))
-        covariance = np.kron(np.ones_like(older), start) + np.kron(older, walk)
-        x = np.tile(np.concatenate([voltage.real, voltage.imag]), lags + 1)
-        return KalmanState(x, covariance), info
-
-    def linear(
-        snapshot: Snapshot,
-        sigma: FloatArray,
-        used: BoolArray,
-        rows: IntArray,
-        at: ComplexArray,
-        walk: FloatArray,
-    ) -> tuple[sparse.csr_array, FloatArray, FloatArray]:
-        """H over the kept instants, z and R of some rows, transformed at a voltage."""
-        H, z, spread = model.rows(snapshot.z, sigma, used, at)
-        H, z, spread = sparse.csr_array(H[rows]), z[rows], spread[rows]
-        if instant:
-            return H, z, np.diag(spread**2)
-        age, window = snapshot.age_s[rows], layout.window_s[rows]
-        R = intervals.bridge_covariance(age, window, step_s, lags) * (H @ walk @ H.T)
-        R[np.diag_indices_from(R)] += spread**2
-        return _lagged(H, intervals.weights(age, window, step_s, lags)), z, R
-
-    def step(state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
-        m = len(layout)
-        before = _voltage(state.x, network.n_bus)
-        walk = process(before, snapshot.time)
-        prior = predict(state, walk)
-        if instant:
-            used, sigma = snapshot.available, snapshot.sigma
-        else:
-            near = intervals.covered(snapshot.age_s, layout.window_s, step_s, lags)
-            used = snapshot.available & snapshot.fresh & near
-            sigma = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
-        if not used.any():
-            return prior, Info.nothing(m, Status.PREDICTED)
-        refused = np.zeros(m, dtype=bool)
-        full = np.full((2, m), np.nan)
-        if refuse is not None:
-            rows = np.flatnonzero(used)
-            lagged, z, R = linear(snapshot, sigma, used, rows, before, walk)
-            full[0, rows] = z - lagged @ prior.x
-            S = _symmetric(lagged @ (lagged @ prior.P).T) + R
-            full[1, rows] = np.sqrt(np.diagonal(S))
-            refused[rows] = refuse(full[0, rows], S)
-            used = used & ~refused
-            if not used.any():
-                return prior, replace(
-                    Info.nothing(m, Status.PREDICTED),
-                    innovation=full[0],
-                    sigma_innovation=full[1],
-                    reasons=_refusals(refused),
-                )
-        rows = np.flatnonzero(used)
-        at = before
-        for passes in range(1, MAX_PASSES + 1):  # noqa: B007 (reported after the loop)
-            lagged, z, R = linear(snapshot, sigma, used, rows, at, walk)
-            try:
-                posterior, innovation, deviation, nis = update(prior, lagged, z, R)
-            except np.linalg.LinAlgError:
-                return None, Info.nothing(
-                    m,
-                    Status.DIVERGED,
-                    "the innovation's covariance is not positive definite: the filter starts "
-                    "again from least squares",
-                )
-            after = _voltage(posterior.x, network.n_bus)
-            if np.abs(after - at).max() < REFINE_PU:
-                break
-            at = after
-        full[0, rows], full[1, rows] = innovation, deviation
-        return posterior, Info(
-            Status.OK,
-            passes,
-            nis,
-            len(rows),
-            used,
-            full[0],
-            full[1],
-            np.zeros(m),
-            reasons=_refusals(refused),
-        )
+        return made.begin(voltage, turn @ solution.covariance() @ turn.T, snapshot.time), info
 
     def read(state: KalmanState) -> Voltages:
-        voltage = _voltage(state.x, network.n_bus)
+        voltage = made.voltage(state.x)
         turn = to_polar(voltage)
-        covariance = turn @ state.P[:n2, :n2] @ turn.T
+        covariance = turn @ state.P[: 2 * n, : 2 * n] @ turn.T
         return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
 
-    return Estimator(name, init, step, read)
+    return Estimator(name, init, made.step, read)
 
 
-def _lagged(H: sparse.csr_array, share: FloatArray) -> sparse.csr_array:
-    """[w₀H, w₁H, …, w_K H] with a row's own weights; most of them are zero. (m, (K+1)·2N)"""
-    m, n = H.shape
-    row = np.repeat(np.arange(m), np.diff(H.indptr))
-    data = H.data[:, None] * share[row]
-    column = H.indices[:, None] + n * np.arange(share.shape[1])
-    kept = share[row] != 0
-    count = np.bincount(row, weights=kept.sum(axis=1), minlength=m)
-    indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    return sparse.csr_array((data[kept], column[kept], indptr), shape=(m, n * share.shape[1]))
+def _innovation(
+    readings: _Readings, turn: ComplexArray, z: FloatArray, spread: FloatArray
+) -> _Innovation:
+    """Innovation of rows in their frames.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If S is not positive definite.
+    """
+    group, expected = readings
+    k = len(expected.mean) // 2
+    eta = z - turn.real * expected.mean[group] - turn.imag * expected.mean[k + group]
+    S = turned(expected.own, turn, group)
+    diagonal = S.reshape(-1)[:: len(S) + 1]
+    diagonal += spread**2
+    sigma = np.sqrt(diagonal)
+    # A symmetric matrix is its own transpose in the order that LAPACK reads.
+    chol_S, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
+    if failed or not np.isfinite(sigma).all():
+        raise np.linalg.LinAlgError("the innovation's covariance is not positive definite")
+    white, _ = lapack.dtrtrs(chol_S, eta, lower=1)
+    return _Innovation(turn, eta, sigma, chol_S, white)
+
+
+def _gained(readings: _Readings, innovation: _Innovation) -> FloatArray:
+    """K η = Cᵀ Tᵀ S⁻¹ η, where T turns functionals into rows and C is their covariance with x."""
+    group, expected = readings
+    k = len(expected.mean) // 2
+    weight, _ = lapack.dtrtrs(innovation.chol_S, innovation.white, lower=1, trans=1)
+    turn = innovation.turn
+    carried = np.concatenate(
+        [np.bincount(group, turn.real * weight, k), np.bincount(group, turn.imag * weight, k)]
+    )
+    return np.asarray(carried @ expected.cross)
+
+
+def _conditioned(P: FloatArray, readings: _Readings, innovation: _Innovation) -> FloatArray:
+    """P - K S Kᵀ = P - X Xᵀ with X = Cᵀ Tᵀ L⁻ᵀ, a symmetric product, in the place of P."""
+    group, expected = readings
+    k = len(expected.mean) // 2
+    turn = innovation.turn
+    cross = turn.real[:, None] * expected.cross[group]
+    cross += turn.imag[:, None] * expected.cross[k + group]
+    X = blas.dtrsm(1.0, innovation.chol_S, cross.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+    return less(P, X)
 
 
 def _refusals(refused: BoolArray) -> npt.NDArray[np.int32]:
     return np.where(refused, int(Reason.INNOVATION), 0).astype(np.int32)
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T))
-
-
-def _voltage(x: FloatArray, n_bus: int) -> ComplexArray:
-    return np.asarray(x[:n_bus] + 1j * x[n_bus : 2 * n_bus])

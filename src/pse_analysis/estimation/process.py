@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import lapack
 
-from pse_analysis.grid.network import BusKind, Network
+from pse_analysis.grid.elements import BusKind
+from pse_analysis.grid.network import Network
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -100,11 +102,15 @@ class Sensitivity:
         """
         n, pq, pv, held = len(voltage), self._pq, self._pv, self.held
         carried = voltage[:, None] * self._admittance
-        current = np.diag(self._admittance @ voltage.conj())
-        by_e, by_f = current + carried, 1j * (current - carried)
+        current = self._admittance @ voltage.conj()
         jacobian = np.empty((2 * n, 2 * n))
-        jacobian[:n, :n], jacobian[:n, n:] = by_e.real, by_f.real
-        jacobian[n:, :n], jacobian[n:, n:] = by_e.imag, by_f.imag
+        jacobian[:n, :n], jacobian[:n, n:] = carried.real, carried.imag
+        jacobian[n:, :n], jacobian[n:, n:] = carried.imag, -carried.real
+        bus = np.arange(n)
+        jacobian[bus, bus] += current.real
+        jacobian[bus, n + bus] -= current.imag
+        jacobian[n + bus, bus] += current.imag
+        jacobian[n + bus, n + bus] += current.real
         jacobian = jacobian[self.inputs]
         # A bus of held magnitude turns, dV = jV dθ, and follows its setting, dV = V/|V| d|V|.
         turned = jacobian[:, n + pv] * voltage.real[pv] - jacobian[:, pv] * voltage.imag[pv]
@@ -112,7 +118,9 @@ class Sensitivity:
         grown = jacobian[:, held] * along.real + jacobian[:, n + held] * along.imag
         unknown = np.concatenate([jacobian[:, pq], jacobian[:, n + pq], turned], axis=1)
         right = np.concatenate([np.eye(len(self.inputs)), -grown], axis=1)
-        solved = np.linalg.solve(unknown, right)
+        _, _, solved, singular = lapack.dgesv(unknown, right, overwrite_a=1, overwrite_b=1)
+        if singular:
+            raise np.linalg.LinAlgError("the power flow is singular at this voltage")
         moved = np.zeros((2 * n, right.shape[1]))
         moved[pq], moved[n + pq] = solved[: len(pq)], solved[len(pq) : 2 * len(pq)]
         theta = solved[2 * len(pq) :]

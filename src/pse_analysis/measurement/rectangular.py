@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -21,6 +23,8 @@ from pse_analysis.measurement.layout import (
     SensorLayout,
     Terminals,
 )
+
+BoolArray = npt.NDArray[np.bool_]
 
 
 class RectangularModel:
@@ -48,46 +52,72 @@ class RectangularModel:
     def __init__(self, network: Network, layout: SensorLayout) -> None:
         self.network = network
         self.layout = layout
-        n = network.n_bus
+        n, m = network.n_bus, len(layout)
         t = Terminals(network, layout)
-        m = len(layout)
-        electric = np.flatnonzero(layout.quantity >= P)
-        plain = np.flatnonzero(layout.quantity < P)
-        row = np.concatenate([np.repeat(electric, np.diff(t.y.indptr)[t.of_row[electric]]), plain])
+        quantity = layout.quantity
+        electric, plain = np.flatnonzero(quantity >= P), np.flatnonzero(quantity < P)
         y_rows = t.y[t.of_row[electric]] if len(electric) else t.y[:0]
+        row = np.concatenate([np.repeat(electric, np.diff(y_rows.indptr)), plain])
         col = np.concatenate([y_rows.indices, layout.position[plain]])
         value = np.concatenate([y_rows.data, np.ones(len(plain), dtype=complex)])
-        order = np.lexsort((col, row))
-        self._row, self._value = row[order], value[order]
-        self._functional = sparse.csr_array((value, (row, col)), shape=(m, n))
-        self._functional.sort_indices()
-        counts = np.diff(self._functional.indptr)
-        # Pattern of H: for every row its e-columns, then its f-columns.
-        self.indptr = np.concatenate([[0], np.cumsum(2 * counts)])
-        start = np.repeat(self.indptr[:-1], counts) + (
-            np.arange(len(self._row)) - np.repeat(self._functional.indptr[:-1], counts)
-        )
-        self._at_e, self._at_f = start, start + np.repeat(counts, counts)
-        self.indices = np.empty(2 * len(self._row), dtype=np.int64)
-        self.indices[self._at_e] = self._functional.indices
-        self.indices[self._at_f] = self._functional.indices + n
-        self._metered = np.where(
-            layout.quantity >= P,
-            np.append(t.metered, 0)[t.of_row],
-            layout.position,
-        )
-        self._partner = _partners(layout)
-        self._across = np.isin(layout.quantity, (VA, IA, Q))
+        self.functionals = sparse.csr_array((value, (row, col)), shape=(m, n)).toarray()
+        self.partner = _partners(layout)
+        self._metered = np.where(quantity >= P, np.append(t.metered, 0)[t.of_row], layout.position)
+        self._angle = np.isin(quantity, (VA, IA))
+        self._size = np.isin(quantity, (VM, IM))
+        self._sign = np.where(quantity == Q, -1.0, 1.0)
+        self._across = np.where(np.isin(quantity, (VA, IA, Q)), 1j, 1.0)
 
-    def paired(self, available: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    def paired(self, available: BoolArray) -> BoolArray:
         """Rows that are available together with the other half of their phasor or power. (m,)"""
-        return np.asarray((self._partner >= 0) & available & available[self._partner])
+        return np.asarray((self.partner >= 0) & available & available[self.partner])
+
+    def frame(
+        self, z: FloatArray, sigma: FloatArray, available: BoolArray, rows: IntArray | None = None
+    ) -> Frame:
+        """Frames of some rows, so far as measured angles and magnitudes fix them.
+
+        Parameters
+        ----------
+        z, sigma : (m,) ndarray
+            Measured values and their σ. [p.u., rad]
+        available : (m,) ndarray of bool
+            Rows that carry a value.
+        rows : (r,) ndarray of int, optional
+            Rows that are wanted, which are available; all if not given.
+        """
+        rows = np.arange(len(self.layout)) if rows is None else rows
+        partner = self.partner[rows]
+        paired = (partner >= 0) & available[partner]
+        value, spread = z[rows], sigma[rows]
+        is_angle, is_size = self._angle[rows], self._size[rows]
+        known = is_angle | (is_size & paired)
+        other = z[partner]
+        unit = np.ones(len(rows), dtype=np.complex128)
+        unit[known] = np.exp(1j * np.where(is_angle, value, other)[known])
+        both = is_angle & paired
+        spread[both] *= np.maximum(np.abs(other[both]), RELATIVE_FLOOR_PU)
+        power = np.flatnonzero(~(is_angle | is_size))
+        linear = np.where(is_size, value, 0.0)
+        linear[power] = self._sign[rows[power]] * value[power]
+        return Frame(
+            self,
+            rows,
+            self._across[rows],
+            unit,
+            linear,
+            spread,
+            power,
+            self._metered[rows[power]],
+            np.flatnonzero(is_size & ~paired),
+            np.flatnonzero(is_angle & ~paired),
+        )
 
     def rows(
         self,
         z: FloatArray,
         sigma: FloatArray,
-        available: npt.NDArray[np.bool_],
+        available: BoolArray,
         voltage: ComplexArray,
     ) -> tuple[sparse.csr_array, FloatArray, FloatArray]:
         """H, z and σ of the linear form at a predicted voltage; rows follow the layout.
@@ -107,35 +137,71 @@ class RectangularModel:
         z_linear : (m,) ndarray
         sigma_linear : (m,) ndarray
         """
-        quantity = self.layout.quantity
-        predicted = self._functional @ voltage
-        partner, paired = self._partner, self.paired(available)
-        angle, size = np.angle(predicted), np.abs(predicted)
-        is_angle = (quantity == VA) | (quantity == IA)
-        is_size = (quantity == VM) | (quantity == IM)
-        is_power = (quantity == P) | (quantity == Q)
-        # The frame of each row: its own or its partner's measured angle, else the predicted one.
-        angle = np.where(is_angle & available, z, angle)
-        angle = np.where(is_size & paired, z[partner], angle)
-        size = np.where(is_angle & paired, np.abs(z[partner]), size)
-        at_meter = voltage[self._metered]
-        angle = np.where(is_power, np.angle(at_meter), angle)
+        turn, linear, spread = self.frame(z, sigma, available).at(voltage)
+        w = turn.conj()[:, None] * self.functionals
+        # Re(w V) = Re(w)·e - Im(w)·f.
+        return sparse.csr_array(np.hstack([w.real, -w.imag])), linear, spread
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Rows of the linear form in so far as they do not depend on the predicted voltage.
+
+    Attributes
+    ----------
+    model : RectangularModel
+    rows : (r,) ndarray of int
+    across : (r,) ndarray of complex
+        1 for a row along its direction, j for one across it.
+    unit : (r,) ndarray of complex
+        e^{jα} of the direction where it is measured.
+    linear, spread : (r,) ndarray
+        z and σ, those of powers still to be divided by |V|.
+    power, metered : (p,) ndarray of int
+        Places of powers in these rows, and their buses.
+    lone_size, lone_angle : ndarray of int
+        Places of magnitudes that lack an angle, and of angles that lack a magnitude.
+    """
+
+    model: RectangularModel
+    rows: IntArray
+    across: ComplexArray
+    unit: ComplexArray
+    linear: FloatArray
+    spread: FloatArray
+    power: IntArray
+    metered: IntArray
+    lone_size: IntArray
+    lone_angle: IntArray
+
+    def at(self, voltage: ComplexArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """The rest, at a predicted voltage.
+
+        Parameters
+        ----------
+        voltage : (N,) ndarray of complex
+            [p.u.]
+
+        Returns
+        -------
+        turn : (r,) ndarray of complex
+            Row i reads Re(conj(turn_i) c_i), where c = ``model.functionals`` V.
+        z_linear, sigma_linear : (r,) ndarray
+        """
+        unit, linear, spread = self.unit.copy(), self.linear.copy(), self.spread.copy()
+        at_meter = voltage[self.metered]
         level = np.abs(at_meter)
-        linear = np.where(is_size, z, 0.0)
-        linear = np.where(quantity == P, z / level, linear)
-        linear = np.where(quantity == Q, -z / level, linear)
-        spread = np.where(is_angle, np.maximum(size, RELATIVE_FLOOR_PU), 1.0) * sigma
-        spread = np.where(is_power, sigma / level, spread)
-        # With w = e^{-jα} y: Re(w V) = Re(w)·e - Im(w)·f and Im(w V) = Im(w)·e + Re(w)·f.
-        turned = self._value * np.exp(-1j * angle)[self._row]
-        across = self._across[self._row]
-        data = np.empty(2 * len(self._row))
-        data[self._at_e] = np.where(across, turned.imag, turned.real)
-        data[self._at_f] = np.where(across, turned.real, -turned.imag)
-        matrix = sparse.csr_array(
-            (data, self.indices, self.indptr), shape=(len(quantity), 2 * self.network.n_bus)
-        )
-        return matrix, linear, spread
+        unit[self.power] = at_meter / level
+        linear[self.power] /= level
+        spread[self.power] /= level
+        if len(self.lone_size):
+            predicted = self.model.functionals[self.rows[self.lone_size]] @ voltage
+            size = np.abs(predicted)
+            unit[self.lone_size] = np.where(size > 0, predicted, 1.0) / np.where(size > 0, size, 1)
+        if len(self.lone_angle):
+            size = np.abs(self.model.functionals[self.rows[self.lone_angle]] @ voltage)
+            spread[self.lone_angle] *= np.maximum(size, RELATIVE_FLOOR_PU)
+        return unit * self.across, linear, spread
 
 
 def _partners(layout: SensorLayout) -> IntArray:
