@@ -1,4 +1,4 @@
-"""Claim: the filter over delays is the textbook's where there is one, and knows when it is blind."""
+"""Claim: the filter over delays equals the textbook's where there is one, and sees when blind."""
 
 from __future__ import annotations
 

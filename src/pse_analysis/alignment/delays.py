@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import eigh_tridiagonal
 
 from pse_analysis.alignment.lag import FEWEST, Band, Reference, span_of
 
@@ -26,8 +27,12 @@ EXCESS = (1.0, 2.0)
 """Noise of both meters together, in multiples of what it should be."""
 LOADS = (0.4, 1.5, 4.0)
 """Standard deviations by which the offset may change between samples, in σ of the device."""
-SLACK = 0.1
-"""How far the slope may be from its usual value, relative to it."""
+SLACK = 0.3
+"""Standard deviation of the slope about its usual value, relative to it.
+
+Magnitudes of two currents are no linear functions of each other: where infeed between the two
+places nearly outweighs the load, the slope may even change its sign.
+"""
 OUTLIERS = 0.03
 """Share of samples at which a meter errs or a load between the two places switches."""
 LITTLE = 1e-12
@@ -60,9 +65,8 @@ class Walk:
         leaving = np.zeros(len(lags))
         leaving[:-1] += root[1:] / root[:-1]
         leaving[1:] += root[:-1] / root[1:]
-        side = np.ones(len(lags) - 1)
-        symmetric = np.diag(side, 1) + np.diag(side, -1) - np.diag(leaving)
-        rate, vector = np.linalg.eigh(0.5 * symmetric / (lags[1] - lags[0]) ** 2)
+        scale = 0.5 / (lags[1] - lags[0]) ** 2
+        rate, vector = eigh_tridiagonal(-scale * leaving, np.full(len(lags) - 1, scale))
         return cls(np.minimum(rate, 0.0), root[:, None] * vector, vector / root[:, None])
 
     def forward(self, weight: FloatArray, variance: FloatArray) -> FloatArray:

@@ -1,0 +1,115 @@
+"""Claim: all channels of a device share a recovered delay, also where one half of it is lost."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pandas as pd
+from simulated_case import STUDY, curves, feeder
+
+from pse_analysis.alignment import fusion, stamps
+from pse_analysis.alignment.dtw import DTW, Method, TimeParams
+from pse_analysis.alignment.stamps import SamplingTimes
+from pse_analysis.measurement import SensorLayout
+from pse_analysis.simulation import simulate
+from pse_analysis.simulation.settings import LoadStepParams, SensorParams, SimulateParams
+from pse_analysis.telemetry import RawCase
+from pse_analysis.validation import ValidateParams, validate
+
+SEED = 21
+PARAMS = TimeParams(largest_delay_s=180.0, window_s=1800.0)
+SENSORS = (
+    SensorParams(
+        "pmu", ("i_ka",), ("branch/3-23", "branch/31-32"), 0.002, 10.0, sigma_kind="relative"
+    ),
+    SensorParams(
+        "scada", ("p_mw", "q_mvar"), ("branch/24-25", "branch/19-20"), 0.005, 60.0,
+        sigma_kind="relative", delay_s=30.0, jitter_s=10.0, wander_s=100.0, wander_time_s=3600.0,
+        stamp="arrival",
+    ),
+    SensorParams("scada", ("vm_pu",), ("bus/18",), 0.005, 60.0, delay_s=5.0),
+)  # fmt: skip
+
+
+@cache
+def made() -> tuple[RawCase, pd.DataFrame]:
+    steps = LoadStepParams(per_day=96.0, size=(0.3, 0.6), duration_s=(300.0, 1800.0), at=("25",))
+    raw = simulate(feeder(), curves(), STUDY, SimulateParams(SEED, SENSORS, load_steps=steps))
+    return raw, validate(raw.telemetry, raw.channels, ValidateParams(), history_end=STUDY.start)
+
+
+def recover(validated: pd.DataFrame, method: Method = "dtw") -> SamplingTimes:
+    raw = made()[0]
+    layout = SensorLayout.from_channels(raw.channels, feeder())
+    return stamps.sampling_times(
+        validated,
+        layout,
+        raw.channels["source"].to_numpy(dtype=object),
+        feeder(),
+        fusion.instants_of(STUDY),
+        fusion.start_of(STUDY),
+        PARAMS,
+        method,
+    )
+
+
+def rows(validated: pd.DataFrame, device: str) -> np.ndarray:
+    return validated["channel"].str.startswith(device).to_numpy()
+
+
+def test_a_device_is_matched_with_the_phasor_current_in_series_and_no_other():
+    found = recover(made()[1])
+    assert found.partner == {"scada:branch/24-25:from": "pmu:branch/3-23:from:i_ka"}
+
+
+def test_stamps_come_nearer_to_the_truth_than_arrival_and_both_channels_share_them():
+    raw, validated = made()
+    found = recover(validated)
+    table = validated.assign(found=found.time, method=found.method)
+    table = table[rows(validated, "scada:branch/24-25") & (found.method == DTW)]
+    assert (table.groupby("arrival_utc")["found"].nunique() == 1).all()
+    assert table.groupby("arrival_utc").size().max() == 2
+    scores = stamps.rms_errors(found, validated, raw.sample_truth, pd.Timestamp(STUDY.start))
+    sure = scores.set_index("method").loc["dtw"]
+    assert sure["rms_s"] < 0.5 * sure["arrival_s"]
+    assert sure["count"] > 0.5 * scores["count"].sum()
+
+
+def test_who_stamps_by_its_own_clock_or_has_no_partner_keeps_its_stamps():
+    validated = made()[1]
+    found = recover(validated)
+    own = microseconds(validated)
+    for device, confidence in (("pmu", 1.0), ("scada:bus/18", 1.0), ("scada:branch/19-20", 0.0)):
+        mine = rows(validated, device)
+        np.testing.assert_array_equal(found.time[mine], own[mine])
+        assert (found.confidence[mine] == confidence).all()
+
+
+def test_a_half_without_its_other_half_is_dated_by_the_samples_beside_it():
+    raw, validated = made()
+    q = rows(validated, "scada:branch/24-25:from:q_mvar")
+    lost = q & (np.random.default_rng(SEED).random(len(validated)) < 0.2)
+    kept = validated[~lost].reset_index(drop=True)
+    found = recover(kept)
+    partner = validated.loc[lost, "arrival_utc"]
+    alone = rows(kept, "scada:branch/24-25:from:p_mw") & kept["arrival_utc"].isin(partner)
+    alone &= (kept["arrival_utc"] >= STUDY.start).to_numpy() & (found.method == DTW)
+    assert alone.sum() >= 10
+    key = ["trial", "channel", "seq"]
+    true = kept.loc[alone, key].merge(raw.sample_truth, on=key)
+    error = (found.time[alone] - microseconds(true)) / 1e6
+    late = (microseconds(kept[alone], "arrival_utc") - microseconds(true)) / 1e6
+    assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(late**2))
+
+
+def test_without_a_method_all_stamps_stay():
+    validated = made()[1]
+    found = recover(validated, "none")
+    np.testing.assert_array_equal(found.time, microseconds(validated))
+
+
+def microseconds(table: pd.DataFrame, column: str = "time_utc") -> np.ndarray:
+    """Microseconds since 1970."""
+    naive = table[column].dt.tz_convert("UTC").dt.tz_localize(None)
+    return np.asarray(naive.to_numpy().astype("datetime64[us]").astype(np.int64))
