@@ -27,7 +27,10 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 Refuse = Callable[[FloatArray, FloatArray], BoolArray]
-"""(innovation (m,), its covariance (m, m)) -> rows that must not be used (m,)."""
+"""(innovation (m,), lower Cholesky factor of its covariance (m, m)) -> rows not to be used (m,).
+
+The filter has the factor already; above the diagonal it is zero.
+"""
 
 
 @dataclass(frozen=True)
@@ -77,15 +80,15 @@ def refuse(params: InnovationParams | None = None) -> Refuse:
     """
     params = params or InnovationParams()
 
-    def refused(innovation: FloatArray, S: FloatArray) -> BoolArray:
+    def refused(innovation: FloatArray, chol_S: FloatArray) -> BoolArray:
         m = len(innovation)
         out = np.zeros(m, dtype=bool)
-        inverse, failed = linalg.lapack.dpotrf(S, lower=1)
-        if failed:
+        inverse, _ = linalg.lapack.dtrtri(chol_S, lower=1)
+        y = inverse.T @ (inverse @ innovation)
+        # Most snapshots hold no error: the diagonal of M = L⁻ᵀL⁻¹ is enough to see that.
+        if not (y * y > params.factor**2 * np.einsum("ij,ij->j", inverse, inverse)).any():
             return out
-        M, _ = linalg.lapack.dpotri(inverse, lower=1)
-        M = np.tril(M) + np.tril(M, -1).T
-        y = M @ innovation
+        M = inverse.T @ inverse
         for _ in range(int(params.largest_share * m)):
             variance = np.where(out, np.inf, np.diagonal(M))
             suspicion = np.abs(y) / np.sqrt(variance)
