@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
+import pandas as pd
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from scipy.linalg import blas
 
@@ -14,6 +15,7 @@ from benchmarks.timing import Row, alternate
 from pse_analysis.estimation.composition import Composition, compose, scalar
 from pse_analysis.estimation.estimator import Snapshot
 from pse_analysis.estimation.gaussian import GaussianFilter
+from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VA, VM, P, Q, SensorLayout
@@ -24,7 +26,9 @@ NOW = np.datetime64("2016-06-09T12:00:00", "us")
 REPEATS = 15
 PEER_REPEATS = 4
 LARGE = 3_500_000
-GRIDS = ("ieee14", "ieee30", "ieee33", "ieee118")
+GRIDS = ("ieee14", "ieee30", "ieee57", "ieee118", "ieee300")
+PEER_UP_TO = 118
+"""Buses up to which filterpy is run by `cost`: beyond, one step takes seconds."""
 
 
 class Step:
@@ -45,21 +49,29 @@ class Step:
         wrong = rng.random(len(sigma)) < 0.05
         self.wrong = np.where(wrong, 10.0 * self.z, self.z)
 
-    def filter(self, **choice: object) -> GaussianFilter:
+    def filter(self, kind: str = "ukf", **choice: object) -> GaussianFilter:
         """A filter of the given composition."""
         variance = scalar(self.network, self.layout, VARIANCE)
         made = Composition(**choice)  # type: ignore[arg-type]
-        return compose("ukf", made, self.network, self.layout, variance)
+        return compose(kind, made, self.network, self.layout, variance)  # type: ignore[arg-type]
+
+    def snapshot(self, z: np.ndarray) -> Snapshot:
+        """Everything reports."""
+        on, zero = np.ones(len(z), dtype=bool), np.zeros(len(z))
+        return Snapshot(NOW, z, self.layout.sigma, zero, on, on, zero)
 
     def work(self, made: GaussianFilter, z: np.ndarray) -> Callable[[], object]:
         """The step of a filter after one snapshot without errors."""
-        on, zero = np.ones(len(z), dtype=bool), np.zeros(len(z))
         start = made.begin(self.x, VARIANCE * np.eye(len(self.x)), NOW)
-        sigma = self.layout.sigma
-        state, _ = made.step(start, Snapshot(NOW, self.z, sigma, zero, on, on, zero))
+        state, _ = made.step(start, self.snapshot(self.z))
         assert state is not None
-        snapshot = Snapshot(NOW, z, sigma, zero, on, on, zero)
+        snapshot = self.snapshot(z)
         return lambda: made.step(state, snapshot)
+
+    def least_squares(self) -> Callable[[], object]:
+        """One snapshot by weighted least squares from a flat start, with its covariance."""
+        made = WeightedLeastSquares(self.network, self.layout)
+        return lambda: made.solve(self.z, self.layout.sigma).covariance()
 
     def peer(self) -> Callable[[], object]:
         """filterpy's predict, points drawn again, and update, with our h."""  # noqa: D403
@@ -93,11 +105,46 @@ class Step:
         return multiply
 
 
+def cost(grids: Sequence[str] = GRIDS, repeats: int = REPEATS) -> pd.DataFrame:
+    """Time of one step against the size of the grid.
+
+    Parameters
+    ----------
+    grids : sequence of str
+    repeats : int
+        Of which the median is taken.
+
+    Returns
+    -------
+    DataFrame
+        A row by grid, indexed by its number of buses; columns are methods. [ms]
+    """
+    _keep_memory()
+    found = {}
+    for grid in grids:
+        step = Step(grid)
+        plain = step.work(step.clean, step.z)
+        sides: dict[str, Callable[[], object]] = {
+            "its dense products": step.products(),
+            "ukf, square root": step.work(step.filter(form="square_root"), step.z),
+            "rukf, gate closed": step.work(step.filter(robustness="per_channel"), step.z),
+            "rukf, gate open": step.work(step.filter(robustness="per_channel"), step.wrong),
+            "ekf": step.work(step.filter("ekf"), step.z),
+            "wls, flat start": step.least_squares(),
+        }
+        if step.network.n_bus <= PEER_UP_TO:
+            sides["filterpy"] = step.peer()
+        spent = {}
+        for name, other in sides.items():
+            few = PEER_REPEATS if name == "filterpy" else repeats
+            spent["ukf"], spent[name] = alternate(plain, other, few)
+        found[step.network.n_bus] = {name: 1e3 * seconds for name, seconds in spent.items()}
+    return pd.DataFrame.from_dict(found, orient="index").rename_axis("buses")
+
+
 def run() -> list[Row]:
-    """Steps on ieee118 with the paper's measurements, and the plain one on every grid."""
-    # Once a large block was freed, as after reading tables, glibc keeps what both sides free and
-    # allocate at every step; before that the page faults are half of the time.
-    np.empty(LARGE)
+    """Steps on ieee118 with the paper's measurements, and those of every grid."""
+    _keep_memory()
     large = Step("ieee118")
     what = "UKF step, ieee118"
     plain = large.work(large.clean, large.z)
@@ -105,18 +152,45 @@ def run() -> list[Row]:
     rows.append(_row(what, plain, large.products(), "its dense products", "at least 0.5 ×"))
     robust = large.filter(robustness="per_channel")
     for name, made, z, note in (
-        ("per channel, gate closed", robust, large.z, "at least 0.9 ×"),
-        ("per channel, gate open", robust, large.wrong, "at least 0.7 ×"),
-        ("trace, gate open", large.filter(robustness="trace"), large.wrong, "at least 0.7 ×"),
-        ("Sage–Husa", large.filter(learning="sage_husa"), large.z, "at least 0.77 ×"),
+        ("square-root form", large.filter(form="square_root"), large.z, _agreement(large)),
+        ("per channel, gate closed", robust, large.z, "expected: at least 0.91 ×"),
+        ("per channel, gate open", robust, large.wrong, "expected: at least 0.71 ×"),
+        ("trace, gate open", large.filter(robustness="trace"), large.wrong, ""),
+        ("Sage–Husa", large.filter(learning="sage_husa"), large.z, "expected: at least 0.77 ×"),
         ("adaptive scaling", large.filter(scaling="moments"), large.z, ""),
     ):
-        rows.append(_row(f"{what}, {name}", large.work(made, z), plain, "plain UKF", note))
-    for grid in GRIDS[:-1]:
-        small = Step(grid)
-        work = small.work(small.clean, small.z)
-        rows.append(_row(f"UKF step, {grid}", work, small.peer(), "filterpy", "", PEER_REPEATS))
+        spent = alternate(large.work(made, z), plain, REPEATS)
+        rows.append(Row(f"{what}, {name}", *spent, "plain UKF", note))
+    table = cost()
+    for buses, times in table.iterrows():
+        others = (f"{name} {value:.3g} ms" for name, value in times.items() if value == value)
+        note = "; ".join(text for text in others if not text.startswith(("ukf ", "filterpy")))
+        ours, peer = 1e-3 * times["ukf"], 1e-3 * times["filterpy"]
+        rows.append(Row(f"UKF step, {buses} buses", ours, peer, "filterpy", note))
     return rows
+
+
+def _agreement(step: Step) -> str:
+    """How far the two forms are apart after 100 steps, relative to the largest entry of P."""
+    rng = np.random.default_rng(SEED)
+    made = [step.filter(form=form) for form in ("covariance", "square_root")]
+    states = [each.begin(step.x, VARIANCE * np.eye(len(step.x)), NOW) for each in made]
+    exact = made[0].model.h(step.x)
+    for _ in range(100):
+        z = exact + step.layout.sigma * rng.standard_normal(len(exact))
+        for i, each in enumerate(made):
+            after, _ = each.step(states[i], step.snapshot(z))
+            assert after is not None
+            states[i] = after
+    one, other = states
+    apart = np.abs(one.P - other.P).max() / np.abs(one.P).max()
+    return f"P differs by {apart:.0e} after 100 steps"
+
+
+def _keep_memory() -> None:
+    # Once a large block was freed, as after reading tables, glibc keeps what both sides free and
+    # allocate at every step; before that the page faults are half of the time.
+    np.empty(LARGE)
 
 
 def _row(
@@ -133,4 +207,6 @@ def _row(
 if __name__ == "__main__":
     for each in run():
         ratio = each.peer_s / each.ours_s if each.ours_s else math.nan
-        print(f"{each.what:45s} {1e3 * each.ours_s:9.3f} ms  {ratio:6.2f} × {each.peer}")
+        print(
+            f"{each.what:45s} {1e3 * each.ours_s:9.3f} ms  {ratio:6.2f} × {each.peer}  {each.note}"
+        )
