@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from pse_analysis import pipeline
+from pse_analysis.alignment import AlignParams
 from pse_analysis.grid import Network
 from pse_analysis.grid.power_flow import solve
+from pse_analysis.parameters import build
 from pse_analysis.pipeline.case import list_cases
 from pse_analysis.pipeline.cli import parser
 from pse_analysis.pipeline.plan import NAMES
@@ -61,10 +65,11 @@ def test_command_exists(line: str) -> None:
     assert getattr(options, "until", None) in {None, *NAMES}
 
 
-def block(language: str) -> str:
-    """The README's one block in a language."""
+def block(language: str, word: str) -> str:
+    """The README's one block in a language that has a word in it."""
     found = re.findall(rf"^```{language}\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
-    assert len(found) == 1, f"{len(found)} {language} blocks"
+    found = [text for text in found if word in text]
+    assert len(found) == 1, f"{len(found)} {language} blocks with {word!r}"
     return str(found[0])
 
 
@@ -110,9 +115,9 @@ def test_own_grid_and_telemetry_run_as_the_readme_says(
     export(tmp_path)
     cases = tmp_path / "pipelines" / "cases"
     cases.mkdir(parents=True)
-    (cases / "my_case.toml").write_text(block("toml"), encoding="utf-8")
+    (cases / "my_case.toml").write_text(block("toml", "[study]"), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    exec(compile(block("python"), "README.md", "exec"), {})
+    exec(compile(block("python", "ingest"), "README.md", "exec"), {})
     results = pipeline.run("my_case", data=tmp_path / "data", cases=cases)
     assert set(results["steps"]["method"]) == {"wls", "kf_load"}
     steps = results["steps"]
@@ -123,3 +128,19 @@ def test_own_grid_and_telemetry_run_as_the_readme_says(
     assert flags.loc[60] == Flag.MISSING
     level = results["estimated"].query("quantity == 'vm_pu'")["value"]
     assert level.between(0.9, 1.1).all()
+
+
+def test_late_sources_are_brought_together_as_the_readme_says() -> None:
+    section = tomllib.loads(block("toml", "latency_s"))["align"]
+    params = build(AlignParams, section, "align")
+    assert params.latency_s == 300
+    assert params.variants[0].time == "dtw"
+
+
+def test_seeds_are_compared_as_the_readme_says() -> None:
+    """The README's own lines, with two seeds in this process for its thirty on all cores."""
+    text = block("python", "monte_carlo").replace("seeds=range(30)", "seeds=range(2), workers=1")
+    names: dict[str, Any] = {}
+    exec(compile(text, "README.md", "exec"), names)
+    assert set(names["scores"]["seed"]) == {0, 1}
+    assert set(names["scores"]["method"]) == {"wls", "kf_scalar", "kf_load"}
