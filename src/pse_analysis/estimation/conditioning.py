@@ -16,6 +16,7 @@ from pse_analysis.estimation.robust import Suspicion
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
+Rows = slice | IntArray
 
 FEW = 4
 """Up to one in so many channels, inflated noise is added to S by a correction of its factor."""
@@ -245,6 +246,13 @@ def symmetric(lower: FloatArray) -> FloatArray:
     out = lower.copy(order="C")
     np.copyto(out, lower.T, where=_above(len(lower)))
     return out
+
+
+def block(rows: Rows, columns: Rows) -> tuple[Rows, Rows]:
+    """Index of a block of a matrix."""
+    if isinstance(rows, slice) or isinstance(columns, slice):
+        return rows, columns
+    return rows[:, None], columns[None, :]
 
 
 @cache

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.estimation.conditioning import Prior
+from pse_analysis.estimation.conditioning import Prior, Rows
 from pse_analysis.measurement import IM, VA, VM, MeasurementModel, P, Q
 from pse_analysis.measurement.layout import Terminals
 
@@ -23,7 +23,6 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 Parts = tuple[FloatArray, FloatArray]
-Rows = slice | IntArray
 
 
 class Spread(NamedTuple):
@@ -35,19 +34,21 @@ class Spread(NamedTuple):
         s: the points stand √s columns of chol(P) from the mean.
     centre : (m,) ndarray
         γ₀.
-    linear, entry : (m-k,) ndarray of int
-        Rows that read one entry of s each, and which; -1 for one that is fixed.
-    curved : (k,) ndarray of int
-        The other rows.
+    linear : slice or ndarray of int
+        Rows that read one entry of s each.
+    entry : ndarray of int
+        Which they read.
+    curved : slice or (k,) ndarray of int
+        Rows that are not linear in x. What reads an angle that is fixed is neither.
     odd, even, shift : (k, n), (k, n), (k,) ndarray
         d_i and e_i in columns, and ē, of the curved rows.
     """
 
     square: float
     centre: FloatArray
-    linear: IntArray
+    linear: Rows
     entry: IntArray
-    curved: IntArray
+    curved: Rows
     odd: FloatArray
     even: FloatArray
     shift: FloatArray
@@ -90,9 +91,9 @@ class _Pattern(NamedTuple):
     """
 
     rows: IntArray
-    linear: IntArray
+    linear: Rows
     entry: IntArray
-    curved: IntArray
+    curved: Rows
     kinds: list[tuple[int, Rows, Rows]]
 
 
@@ -120,14 +121,13 @@ class SigmaPoints:
         self._pattern = self._pattern_of(np.arange(len(layout)))
 
     def _pattern_of(self, rows: IntArray) -> _Pattern:
-        linear, curved = (
-            np.flatnonzero(part) for part in (self._straight[rows], ~self._straight[rows])
-        )
+        entry, straight = self._entry[rows], self._straight[rows]
+        linear, curved = np.flatnonzero(straight & (entry >= 0)), np.flatnonzero(~straight)
         quantity = self.model.layout.quantity[rows[curved]]
         terminal = self._terminals.of_row[rows[curved]]
         rows_of = {int(q): np.flatnonzero(quantity == q) for q in np.unique(quantity)}
         kinds = [(q, run(at), run(terminal[at])) for q, at in rows_of.items()]
-        return _Pattern(rows, linear, self._entry[rows[linear]], curved, kinds)
+        return _Pattern(rows, run(linear), entry[linear], run(curved), kinds)
 
     def spread(self, prior: Prior, square: float, rows: IntArray) -> Spread:
         """Odd and even parts of h along the columns of √s chol(P), for some rows of the layout.
@@ -148,7 +148,8 @@ class SigmaPoints:
             self._pattern = self._pattern_of(rows)
         _, linear, entry, curved, kinds = self._pattern
         n, a = prior.n, self._angles
-        odd, even = np.empty((2, len(curved), n))
+        centre = self.model.h(prior.x)[rows]
+        odd, even = np.empty((2, len(centre[curved]), n))
         if kinds:
             turned, stretched = self._phasors(prior, np.sqrt(square) * prior.chol_P[:n, :n])
             for columns, phasors in ((slice(0, a), turned), (slice(a, n), stretched)):
@@ -156,7 +157,6 @@ class SigmaPoints:
                 for q, at, source in kinds:
                     first, second = found.of(q)
                     odd[at, columns], even[at, columns] = first[source], second[source]
-        centre = self.model.h(prior.x)[rows]
         return Spread(square, centre, linear, entry, curved, odd, even, even.sum(axis=1) / square)
 
     def _phasors(

@@ -22,7 +22,9 @@ from scipy.linalg import blas, lapack
 from pse_analysis.estimation.conditioning import (
     Posterior,
     Prior,
+    Rows,
     Verdict,
+    block,
     factor,
     solve,
     symmetric,
@@ -45,7 +47,7 @@ class Halves(NamedTuple):
         ŷ.
     odd : (m, n) ndarray
         D: C = L Dᵀ with the first n columns of L.
-    curved : (k,) ndarray of int
+    curved : slice or (k,) ndarray of int
         Rows that deviate in other ways as well.
     bent : (k, j) ndarray
         How: S = R + D Dᵀ + B Bᵀ, where B has these rows.
@@ -55,7 +57,7 @@ class Halves(NamedTuple):
 
     mean: FloatArray
     odd: FloatArray
-    curved: IntArray
+    curved: Rows
     bent: FloatArray
     tuned: float = 0.0
 
@@ -65,8 +67,8 @@ class Halves(NamedTuple):
         """Condition on an innovation, with the noise that a verdict leaves; see `Predicted`."""
         m = len(noise)
         rest = np.zeros((m, m), order="F")
-        if len(self.curved):
-            inside = np.ix_(self.curved, self.curved)
+        if len(self.bent):
+            inside = block(self.curved, self.curved)
             rest[inside] = blas.dsyrk(1.0, self.bent.T, trans=1, lower=1)
         known = np.diagonal(rest).copy()
         variance = known + noise + np.einsum("ij,ij->i", self.odd, self.odd)

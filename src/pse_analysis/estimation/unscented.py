@@ -38,10 +38,10 @@ from scipy import optimize
 from scipy.linalg import blas, lapack
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.conditioning import Moments, Predicted, Prior
+from pse_analysis.estimation.conditioning import Moments, Predicted, Prior, block
 from pse_analysis.estimation.estimator import Snapshot
 from pse_analysis.estimation.gaussian import Observation
-from pse_analysis.estimation.sigma_points import Rows, SigmaPoints, Spread, run
+from pse_analysis.estimation.sigma_points import SigmaPoints, Spread
 from pse_analysis.estimation.square_root import Halves
 from pse_analysis.measurement import BUS, FROM, TO, MeasurementModel, P, Q, wrap
 
@@ -97,9 +97,8 @@ def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Mom
     m, n = len(spread.centre), prior.n
     # Row by row here: column by column, as BLAS reads it, in what is returned.
     cross, own = np.zeros((m, len(prior.s))), np.zeros((m, m))
-    read = spread.entry >= 0
-    linear, entry, curved = run(spread.linear[read]), spread.entry[read], run(spread.curved)
-    if len(spread.curved):
+    linear, entry, curved = spread.linear, spread.entry, spread.curved
+    if len(spread.shift):
         root = 1.0 / np.sqrt(spread.square)
         if n == len(prior.s):
             product = blas.dtrmm(root, prior.chol_P, spread.odd.T, lower=1)
@@ -107,8 +106,8 @@ def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Mom
             product = blas.dgemm(root, prior.chol_P[:, :n], spread.odd.T)
         cross[curved] = product.T
         both = np.hstack([spread.odd, _bent(prior, spread, scaling, alpha)])
-        own[_block(curved, curved)] = blas.dsyrk(root**2, both.T, trans=1, lower=1).T
-        own[_block(curved, linear)] = product[entry].T
+        own[block(curved, curved)] = blas.dsyrk(root**2, both.T, trans=1, lower=1).T
+        own[block(curved, linear)] = product[entry].T
     cross[linear] = prior.P[entry]
     own[linear] = cross[:, entry].T
     return Moments(spread.mean, own.T, cross.T, alpha)
@@ -118,8 +117,7 @@ def halves(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Halv
     """The prediction as a mean and weighted deviations."""
     root = 1.0 / np.sqrt(spread.square)
     odd = np.zeros((len(spread.centre), prior.n))
-    read = spread.entry >= 0
-    odd[spread.linear[read]] = prior.chol_P[spread.entry[read], : prior.n]
+    odd[spread.linear] = prior.chol_P[spread.entry, : prior.n]
     odd[spread.curved] = root * spread.odd
     bent = root * _bent(prior, spread, scaling, alpha)
     return Halves(spread.mean, odd, spread.curved, bent, alpha)
@@ -229,13 +227,6 @@ def by_likelihood(
         return _FORMS[form](prior, spread(alpha), scaling, alpha)
 
     return Observation(predict, scaling.alpha)
-
-
-def _block(rows: Rows, columns: Rows) -> tuple[Rows | IntArray, Rows | IntArray]:
-    """Index of a block of a matrix."""
-    if isinstance(rows, slice) or isinstance(columns, slice):
-        return rows, columns
-    return rows[:, None], columns[None, :]
 
 
 def _square(scaling: Scaling, alpha: float, n: int) -> float:
