@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import composition, load_learning, machine, process, screening
+from pse_analysis.estimation import (
+    composition,
+    load_learning,
+    machine,
+    matching,
+    process,
+    screening,
+)
 from pse_analysis.estimation.composition import Composition
 from pse_analysis.estimation.estimator import Estimated, Estimator, Record, States, record, run
 from pse_analysis.estimation.kalman import kalman_filter
@@ -36,15 +43,16 @@ class Method:
     filter : {"wls", "kalman", "ukf", "ekf", "observer"}
         ``observer`` is a machine's, the others are a grid's. ``kalman`` is linear in rectangular
         coordinates, ``ukf`` and ``ekf`` are polar.
-    noise : {"load", "scalar"}
-        Process noise of a filter.
+    noise : {"load", "scalar", "innovation"}
+        Process noise of a filter: loads as history moved them, q I, or, in a ``kalman`` filter,
+        loads and source as its own innovations tell (`pse_analysis.estimation.matching`).
     variance : float
         q of ``scalar`` noise, per step. [p.u.², rad²]
     source_sigma : float, optional
         σ of the source voltage's change per step for ``load`` noise; learnt from history if not
         given. [p.u.]
     compose : Composition
-        What a ``ukf`` or ``ekf`` is made of.
+        What a ``ukf`` or ``ekf`` is made of; of a ``kalman`` filter, the process only.
     observer : ObserverParams, optional
         What an ``observer`` is designed from.
     reading : {"interval", "instant"}
@@ -59,7 +67,7 @@ class Method:
 
     name: str
     filter: Literal["wls", "kalman", "ukf", "ekf", "observer"]
-    noise: Literal["load", "scalar"] = "load"
+    noise: Literal["load", "scalar", "innovation"] = "load"
     variance: float = 1e-6
     source_sigma: float | None = None
     compose: Composition = field(default_factory=Composition)
@@ -70,16 +78,19 @@ class Method:
 
     def __post_init__(self) -> None:
         if self.filter != "kalman" and (
-            self.reading == "instant" or self.screening == "innovation"
+            self.reading == "instant" or "innovation" in (self.screening, self.noise)
         ):
             raise ParameterError(
-                f'[estimate.methods] {self.name!r}: reading = "instant" and screening = '
+                f'[estimate.methods] {self.name!r}: reading = "instant" and screening or noise = '
                 f'"innovation" are for filter = "kalman", not for {self.filter!r}: drop them'
             )
-        if self.filter not in ("ukf", "ekf") and self.compose != Composition():
+        plain = Composition()
+        if self.filter == "kalman":
+            plain = replace(plain, process=self.compose.process, holt=self.compose.holt)
+        if self.filter not in ("ukf", "ekf") and self.compose != plain:
             raise ParameterError(
-                f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, not for "
-                f"{self.filter}: drop it"
+                f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, and its "
+                f"process and holt for kalman, not for {self.filter}: drop the rest"
             )
         if (self.filter == "observer") != (self.observer is not None):
             raise ParameterError(
@@ -132,21 +143,15 @@ def _build_plain(
         )
     if method.filter == "wls":
         return tracking_wls(method.name, network, layout)
-    noise = (
-        process.scalar_noise(network, method.variance)
-        if method.noise == "scalar"
-        else process.load_noise(
-            network,
-            load_learning.learn_load(
-                history, layout, network, study.step_s, source=method.source_sigma
-            ),
-        )
-    )
+    if method.noise == "innovation":
+        noise: process.ProcessNoise | matching.Matching = matching.of_loads(network)
+    else:
+        noise = known = _known_noise(method, network, layout, study, history)
     if method.filter in ("ukf", "ekf"):
         polar = (
             composition.scalar(network, layout, method.variance)
             if method.noise == "scalar"
-            else of_grid(network, noise, state_columns(network, layout))
+            else of_grid(network, known, state_columns(network, layout))
         )
         return composition.build(method.name, method.filter, method.compose, network, layout, polar)
     return kalman_filter(
@@ -158,7 +163,19 @@ def _build_plain(
         reach_s=_reach(history, layout, study.step_s),
         instant=method.reading == "instant",
         refuse=screening.refuse() if method.screening == "innovation" else None,
+        process=composition.process_of(method.compose),
     )
+
+
+def _known_noise(
+    method: Method, network: Network, layout: SensorLayout, study: Study, history: Record
+) -> process.ProcessNoise:
+    if method.noise == "scalar":
+        return process.scalar_noise(network, method.variance)
+    learnt = load_learning.learn_load(
+        history, layout, network, study.step_s, source=method.source_sigma
+    )
+    return process.load_noise(network, learnt)
 
 
 def _reach(history: Record, layout: SensorLayout, step_s: float) -> float:

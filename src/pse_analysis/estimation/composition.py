@@ -57,6 +57,13 @@ class Composition:
     protection: Protection = field(default_factory=Protection)
 
 
+def process_of(composition: Composition) -> holt.Process:
+    """How the mean moves in a composition."""
+    if composition.process == "random_walk":
+        return holt.random_walk()
+    return (holt.holt if composition.process == "holt" else holt.local_trend)(composition.holt)
+
+
 def compose(
     kind: Literal["ukf", "ekf"],
     composition: Composition,
@@ -80,11 +87,7 @@ def compose(
     GaussianFilter
     """
     model = MeasurementModel(network, layout, state_columns(network, layout))
-    if composition.process == "random_walk":
-        process = holt.random_walk()
-    else:
-        smoothing = holt.holt if composition.process == "holt" else holt.local_trend
-        process = smoothing(composition.holt)
+    process = process_of(composition)
     made = (
         noise.known(voltages, process)
         if composition.learning == "none"

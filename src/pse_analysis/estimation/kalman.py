@@ -9,24 +9,23 @@ covers them (`pse_analysis.estimation.intervals`). So a sample enters once, wher
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import blas, lapack
 
 from pse_analysis.estimation import holt, intervals
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
-from pse_analysis.estimation.lagged import (
-    Belief,
-    Expected,
-    Functionals,
-    Lagged,
-    Reach,
-    less,
-    turned,
-)
+from pse_analysis.estimation.lagged import Belief, Functionals, Lagged, Reach
+from pse_analysis.estimation.matching import Matched, Matching
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
+from pse_analysis.estimation.readings import (
+    Readings,
+    conditioned,
+    gained,
+    innovation_of,
+    responses,
+)
 from pse_analysis.estimation.screening import Refuse
 from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
@@ -59,36 +58,14 @@ class KalmanState:
         Its covariance.
     process : object
         Memory of the process.
+    noise : Matched, optional
+        Memory of a noise that is estimated.
     """
 
     x: FloatArray
     P: FloatArray
     process: Any = None
-
-
-class _Readings(NamedTuple):
-    """What rows read of the state, whatever their frames.
-
-    Attributes
-    ----------
-    group : (r,) ndarray of int
-        Functional of each row; both halves of a phasor or power read the same one.
-    expected : Expected
-        Moments of the functionals.
-    """
-
-    group: IntArray
-    expected: Expected
-
-
-class _Innovation(NamedTuple):
-    """η of rows at a voltage, with the lower Cholesky factor of S and L⁻¹η."""
-
-    turn: ComplexArray
-    eta: FloatArray
-    sigma: FloatArray
-    chol_S: FloatArray
-    white: FloatArray
+    noise: Matched | None = None
 
 
 class KalmanFilter:
@@ -98,7 +75,7 @@ class KalmanFilter:
         self,
         network: Network,
         layout: SensorLayout,
-        noise: ProcessNoise,
+        noise: ProcessNoise | Matching,
         *,
         step_s: float,
         lags: int,
@@ -120,13 +97,24 @@ class KalmanFilter:
         )
         self._patterns: dict[bytes, Functionals] = {}
 
-    def walk(self, x: FloatArray, time: np.datetime64) -> FloatArray:
-        """Q (2N, 2N) of the step to an instant, at a forecast."""
-        covariance = self._noise(self.voltage(x), time)
-        if self._held is not None:
-            covariance = covariance.copy()
-            covariance[self._held, :] = covariance[:, self._held] = 0.0
-        return covariance
+    def walk(
+        self, memory: Matched | None, x: FloatArray, time: np.datetime64
+    ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+        """Q (2N, 2N) of the step to an instant, at a forecast; its shapes if it is estimated."""
+        if isinstance(self._noise, Matching):
+            halves = tuple(self._free(half) for half in self._noise.halves(self.voltage(x)))
+            level = self._noise.start if memory is None else memory.level
+            whole = np.hstack([np.sqrt(t) * half for t, half in zip(level, halves, strict=True)])
+            return whole @ whole.T, halves
+        return self._free(self._free(self._noise(self.voltage(x), time)).T), ()
+
+    def _free(self, rows: FloatArray) -> FloatArray:
+        """Rows of [e; f], zero where it is held."""
+        if self._held is None:
+            return rows
+        rows = rows.copy()
+        rows[self._held] = 0.0
+        return rows
 
     def voltage(self, x: FloatArray) -> ComplexArray:
         """Present voltage of a state. (N,)"""
@@ -138,18 +126,20 @@ class KalmanFilter:
     ) -> KalmanState:
         """State from a voltage and the covariance (2N, 2N) of its [e; f]."""
         x = np.concatenate([voltage.real, voltage.imag])
-        return KalmanState(*self.lagged.begin(x, covariance, self.walk(x, time)))
+        noise = self._noise.begin() if isinstance(self._noise, Matching) else None
+        return KalmanState(*self.lagged.begin(x, covariance, self.walk(noise, x, time)[0]), noise)
 
     def step(self, state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
         """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
         m = len(self.layout)
         belief = Belief(state.x, state.P, state.process)
         forecast = self.lagged.forecast(belief)
-        noise = self.lagged.process.noise(self.walk(forecast[0], snapshot.time))
+        walk, shapes = self.walk(state.noise, forecast[0], snapshot.time)
+        noise = self.lagged.process.noise(walk)
         prior = self.lagged.moved(belief, forecast, noise)
         used, sigma = self._usable(snapshot)
         if not used.any():
-            return KalmanState(*prior), Info.nothing(m, Status.PREDICTED)
+            return KalmanState(*prior, state.noise), Info.nothing(m, Status.PREDICTED)
         rows = np.flatnonzero(used)
         readings = self._read(belief, prior, noise, snapshot, rows)
         frame = self.model.frame(snapshot.z, sigma, used, rows)
@@ -157,7 +147,7 @@ class KalmanFilter:
         full = np.full((2, m), np.nan)
         refused = np.zeros(m, dtype=bool)
         try:
-            innovation = _innovation(readings, *frame.at(at))
+            innovation = innovation_of(readings, *frame.at(at))
             if self.refuse is not None:
                 out = self.refuse(innovation.eta, innovation.chol_S)
                 if out.any():
@@ -167,21 +157,21 @@ class KalmanFilter:
                     used = used & ~refused
                     rows, readings = rows[~out], readings._replace(group=readings.group[~out])
                     if not len(rows):
-                        return KalmanState(*prior), replace(
+                        return KalmanState(*prior, state.noise), replace(
                             Info.nothing(m, Status.PREDICTED),
                             innovation=full[0],
                             sigma_innovation=full[1],
                             reasons=_refusals(refused),
                         )
                     frame = self.model.frame(snapshot.z, sigma, used, rows)
-                    innovation = _innovation(readings, *frame.at(at))
+                    innovation = innovation_of(readings, *frame.at(at))
             for passes in range(1, MAX_PASSES + 1):
-                x = prior.x + _gained(readings, innovation)
+                x = prior.x + gained(readings, innovation)
                 after = self.voltage(x)
                 if passes == MAX_PASSES or np.abs(after - at).max() < REFINE_PU:
                     break
                 at = after
-                innovation = _innovation(readings, *frame.at(at))
+                innovation = innovation_of(readings, *frame.at(at))
         except np.linalg.LinAlgError:
             return None, Info.nothing(
                 m,
@@ -190,7 +180,12 @@ class KalmanFilter:
                 "again from least squares",
             )
         full[0, rows], full[1, rows] = innovation.eta, innovation.sigma
-        return KalmanState(x, _conditioned(prior.P, readings, innovation), prior.memory), Info(
+        learnt = state.noise
+        if isinstance(self._noise, Matching) and learnt is not None:
+            response = responses(shapes, readings, innovation)
+            learnt = self._noise.learn(learnt, response, innovation.white)
+        P = conditioned(prior.P, readings, innovation)
+        return KalmanState(x, P, prior.memory, learnt), Info(
             Status.OK,
             passes,
             float(innovation.white @ innovation.white),
@@ -219,7 +214,7 @@ class KalmanFilter:
         noise: FloatArray,
         snapshot: Snapshot,
         rows: IntArray,
-    ) -> _Readings:
+    ) -> Readings:
         """Moments of what some rows of a snapshot read."""
         first = self._first[rows]
         age, window = snapshot.age_s, self.layout.window_s
@@ -235,22 +230,23 @@ class KalmanFilter:
                 self._patterns.clear()
             self._patterns[key] = Functionals(self.model.functionals[wanted])
         functionals = self._patterns[key]
-        if self.instant:
-            reach = None
-        else:
+        reach: Reach | None = None
+        moving: FloatArray | float = 1.0
+        if not self.instant:
             ages, windows, kind = intervals.kinds(age[wanted], window[wanted])
             between = ages, windows, self.step_s, self.lagged.lags
             bridge = intervals.bridge_covariance(*between)
             reach = Reach(intervals.weights(*between)[kind], bridge[kind[:, None], kind])
+            moving = reach.moving
         expected = self.lagged.expect(belief, prior, noise, functionals, reach)
-        return _Readings(number[first], expected)
+        return Readings(number[first], expected, functionals.plane, moving)
 
 
 def kalman_filter(
     name: str,
     network: Network,
     layout: SensorLayout,
-    noise: ProcessNoise,
+    noise: ProcessNoise | Matching,
     *,
     step_s: float,
     reach_s: float = 0.0,
@@ -266,8 +262,8 @@ def kalman_filter(
         Of the method.
     network : Network
     layout : SensorLayout
-    noise : ProcessNoise
-        Q of the step to an instant.
+    noise : ProcessNoise or Matching
+        Q of the step to an instant, given or estimated from the innovations before it.
     step_s : float
         Step between instants. [s]
     reach_s : float
@@ -325,54 +321,6 @@ def kalman_filter(
         return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
 
     return Estimator(name, init, made.step, read)
-
-
-def _innovation(
-    readings: _Readings, turn: ComplexArray, z: FloatArray, spread: FloatArray
-) -> _Innovation:
-    """Innovation of rows in their frames.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If S is not positive definite.
-    """
-    group, expected = readings
-    k = len(expected.mean) // 2
-    eta = z - turn.real * expected.mean[group] - turn.imag * expected.mean[k + group]
-    S = turned(expected.own, turn, group)
-    diagonal = S.reshape(-1)[:: len(S) + 1]
-    diagonal += spread**2
-    sigma = np.sqrt(diagonal)
-    # A symmetric matrix is its own transpose in the order that LAPACK reads.
-    chol_S, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
-    if failed or not np.isfinite(sigma).all():
-        raise np.linalg.LinAlgError("the innovation's covariance is not positive definite")
-    white, _ = lapack.dtrtrs(chol_S, eta, lower=1)
-    return _Innovation(turn, eta, sigma, chol_S, white)
-
-
-def _gained(readings: _Readings, innovation: _Innovation) -> FloatArray:
-    """K η = Cᵀ Tᵀ S⁻¹ η, where T turns functionals into rows and C is their covariance with x."""
-    group, expected = readings
-    k = len(expected.mean) // 2
-    weight, _ = lapack.dtrtrs(innovation.chol_S, innovation.white, lower=1, trans=1)
-    turn = innovation.turn
-    carried = np.concatenate(
-        [np.bincount(group, turn.real * weight, k), np.bincount(group, turn.imag * weight, k)]
-    )
-    return np.asarray(carried @ expected.cross)
-
-
-def _conditioned(P: FloatArray, readings: _Readings, innovation: _Innovation) -> FloatArray:
-    """P - K S Kᵀ = P - X Xᵀ with X = Cᵀ Tᵀ L⁻ᵀ, a symmetric product, in the place of P."""
-    group, expected = readings
-    k = len(expected.mean) // 2
-    turn = innovation.turn
-    cross = turn.real[:, None] * expected.cross[group]
-    cross += turn.imag[:, None] * expected.cross[k + group]
-    X = blas.dtrsm(1.0, innovation.chol_S, cross.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-    return less(P, X)
 
 
 def _refusals(refused: BoolArray) -> npt.NDArray[np.int32]:

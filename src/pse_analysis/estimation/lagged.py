@@ -70,6 +70,11 @@ class Reach(NamedTuple):
     share: FloatArray
     bridge: FloatArray
 
+    @property
+    def moving(self) -> FloatArray:
+        """Share of Q in the covariance of the functionals. (k, k)"""
+        return np.asarray(np.outer(self.share[:, 0], self.share[:, 0]) + self.bridge)
+
 
 class Functionals:
     """Complex functionals c = y (e + jf) of one instant's voltages as real rows, [Re; Im].
@@ -242,9 +247,9 @@ class Lagged:
         before = rows @ belief.P
         moving = plane @ noise[:n]
         own = rows @ before.T
-        own.reshape(2, len(now), 2, len(now))[...] += (np.outer(now, now) + reach.bridge)[
-            :, None
-        ] * (moving[:, :n] @ plane.T).reshape(2, len(now), 2, len(now))
+        own.reshape(2, len(now), 2, len(now))[...] += reach.moving[:, None] * (
+            moving[:, :n] @ plane.T
+        ).reshape(2, len(now), 2, len(now))
 
         cross = np.empty((m, blocks, n))
         known = before.reshape(m, blocks, n)
