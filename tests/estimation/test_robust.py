@@ -12,13 +12,14 @@ from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import robust
 from pse_analysis.estimation.estimator import run
 from pse_analysis.estimation.gaussian import estimator
-from pse_analysis.estimation.replay import EPOCH, Replay
+from pse_analysis.estimation.replay import EPOCH, Replay, replay
 from pse_analysis.estimation.robust import MARGIN, Protection, Suspicion, gate
-from pse_analysis.measurement import VM
+from pse_analysis.grid.power_flow import solve
+from pse_analysis.measurement import VA, VM, MeasurementModel, Q
 from pse_analysis.vocabulary import Reason, Status
 
 SEED = 30
-TRIALS = 30
+TRIALS = 12
 
 
 def suspicion(rng: np.random.Generator, m: int = 12, wrong: tuple[int, ...] = ()) -> Suspicion:
@@ -139,7 +140,7 @@ def test_plain_filter_is_thrown_off_by_a_voltage_a_hundred_times_too_high() -> N
 
 
 def test_per_channel_rides_out_gross_errors_at_every_instant() -> None:
-    """30 trials, 5 % of all samples times 10: error, precision and recall."""
+    """Twelve trials, 5 % of all samples times 10: error, precision and recall."""
     b = real_day()
     rng = np.random.default_rng(SEED)
     made = b.filter(process="holt", robustness="per_channel")
@@ -172,18 +173,63 @@ def clean_at(q: float) -> np.ndarray:
 @pytest.mark.parametrize("q", [1e-6, 1e-2], ids=["Q/100", "100Q"])
 @pytest.mark.parametrize("robustness", ["trace", "per_channel"])
 def test_protected_filter_does_not_diverge_where_q_is_wrong(robustness: str, q: float) -> None:
-    """30 trials: at no time in the last quarter is a voltage or an angle off by 0.15."""
+    """Ten trials: at no time is a voltage or an angle off by 0.15."""
     b = real_day()
     rng = np.random.default_rng(SEED)
     made = b.filter(process="holt", q=q, robustness=robustness)
-    for _ in range(TRIALS):
+    for _ in range(10):
         done = b.run(made, b.measure(rng))
-        assert np.abs(done.x[-36:] - b.truth[-36:]).max() < 0.15
+        assert np.abs(done.x - b.truth).max() < 0.15
+
+
+@pytest.mark.parametrize("q", [1e-4, 1e-2], ids=["Q", "100Q"])
+def test_protected_trace_stays_near_with_gross_errors_at_every_instant(q: float) -> None:
+    """5 % of all samples times 10: half of the steps are within 0.05 rad, nearly all in 0.5."""
+    b = real_day()
+    rng = np.random.default_rng(SEED)
+    made = b.filter(process="holt", q=q, robustness="trace")
+    done = b.run(made, gross_errors(b.measure(rng), 0.05, rng)[0])
+    off = np.abs(done.x - b.truth)[:, : b.network.n_bus].max(axis=1)
+    assert np.median(off) < 0.05
+    assert np.quantile(off, 0.95) < 0.5
+    assert done.times(Status.RESTARTED) > 30
 
 
 # --------------------------------------------------------------------------------------------------
 # Latching
 # --------------------------------------------------------------------------------------------------
+
+
+def stepped(b: Bench, share: float = 0.3, at: int = 30) -> Bench:
+    """The load of every other bus grows at one instant and stays."""
+    power = b.network.p_nominal_pu[:, None] * np.ones(2 * at)
+    power[::2, at:] *= 1.0 + share
+    x = solve(b.network, power).x.T
+    return Bench(b.network, b.layout, x, MeasurementModel(b.network, b.layout).h(x.T).T)
+
+
+@pytest.mark.parametrize("robustness", ["trace", "per_channel"])
+def test_filter_with_too_small_q_comes_back_after_a_real_step_of_load(robustness: str) -> None:
+    """Q a hundred times below the best, clean data: back within five steps, for it said so."""
+    b = stepped(still("ieee30"))
+    moved = np.abs(b.truth[-1] - b.truth[0]).max()
+    rng = np.random.default_rng(SEED)
+    made = b.filter(process="holt", q=1e-6, robustness=robustness)
+    for _ in range(5):
+        done = b.run(made, b.measure(rng))
+        off = np.abs(done.x - b.truth).max(axis=1)
+        assert off[30] > 0.3 * moved
+        assert off[35:].max() < 0.25 * moved
+        assert off[50:].max() < 0.04
+        assert done.times(Status.RESTARTED) >= 1
+
+
+def test_unprotected_trace_does_not_come_back_after_a_real_step_of_load() -> None:
+    b = stepped(still("ieee30"))
+    moved = np.abs(b.truth[-1] - b.truth[0]).max()
+    made = b.filter(process="holt", q=1e-6, robustness="trace", protected=False)
+    done = b.run(made, b.measure(np.random.default_rng(SEED)))
+    assert np.abs(done.x - b.truth).max(axis=1)[-1] > 0.5 * moved
 
 
 def jump(b: Bench, made: object, at: int = 8) -> Replay:
@@ -200,15 +246,47 @@ def test_real_jump_is_refused_at_first_then_followed_and_said_so(robustness: str
     b = still("ieee14")
     truth = b.truth[0].copy()
     truth[: b.network.n_bus] += 0.1 * np.linspace(0.5, 1.0, b.network.n_bus)
-    protected, latched = (
+    protected, alone = (
         jump(b, b.filter(q=1e-8, robustness=robustness, protected=p)) for p in (True, False)
     )
     assert np.abs(protected.x[-1] - truth).max() < 0.03
-    assert np.abs(latched.x[-1] - truth).max() > 0.05
+    assert np.abs(alone.x[-1] - truth).max() > np.abs(protected.x[-1] - truth).max()
     assert protected.times(Status.RESTARTED) >= 1
     told = [i.detail for i in protected.info if i.status is Status.RESTARTED]
-    assert "refused 3 times in a row" in told[0]
-    assert latched.times(Status.RESTARTED) == 0
+    assert "refused 3 times in a row: the filter starts again from this snapshot" in told[0]
+    assert alone.times(Status.RESTARTED) == 0
+
+
+def test_forecast_is_widened_where_a_snapshot_alone_is_not_enough() -> None:
+    """Half of the magnitudes and no reactive power: least squares cannot start."""
+    b = still("ieee14")
+    made = b.filter(q=1e-8, robustness="trace")
+    seen = b.layout.quantity != Q
+    seen &= (b.layout.quantity != VM) | (b.layout.position % 2 == 0)
+    truth = np.repeat(b.truth[:1], 21, axis=0)
+    truth[8:, : b.network.n_bus] += 0.1 * np.linspace(0.5, 1.0, b.network.n_bus)
+    z = made.model.h(truth.T).T
+    z += b.layout.sigma * np.random.default_rng(SEED).standard_normal(z.shape)
+    known = np.broadcast_to(seen, z.shape)
+    done = replay(made, truth[0], b.start, z, b.layout.sigma, available=known)
+    told = [i.detail for i in done.info if i.status is Status.RESTARTED]
+    assert "the forecast was widened" in told[0]
+    assert np.abs(done.x[-1] - truth[-1])[: b.network.n_bus].max() < 0.05
+
+
+def test_movement_that_many_channels_see_is_no_error() -> None:
+    """All angles turn by 0.04 rad, far more than Q allows: acquitted by the snapshot itself."""
+    b = still("ieee30")
+    made = b.filter(q=1e-5, robustness="per_channel", protected=False)
+    truth = np.repeat(b.truth[:1], 3, axis=0)
+    truth[2:, : b.network.n_bus] += 0.04
+    z = made.model.h(truth.T).T
+    z += b.layout.sigma * np.random.default_rng(SEED).standard_normal(z.shape)
+    angles = b.layout.quantity == VA
+    done = replay(made, truth[0], 1e-5 * np.eye(len(b.start)), z, b.layout.sigma)
+    last = done.info[-1]
+    assert (np.abs(last.innovation[angles]) > 3.0 * last.sigma_innovation[angles]).all()
+    assert not last.inflation.any()
 
 
 def test_meter_that_stays_wrong_is_not_believed_for_it() -> None:
@@ -218,7 +296,7 @@ def test_meter_that_stays_wrong_is_not_believed_for_it() -> None:
     z[5:, broken] += 0.5
     done = b.run(b.filter(robustness="per_channel"), z)
     assert (done.field("inflation")[4:, broken] > 0).all()
-    assert any("does not clear them" in i.detail for i in done.info)
+    assert any("the snapshot alone refuses" in i.detail for i in done.info)
     assert max(done.rmse(b.truth)) < 0.02
 
 

@@ -184,7 +184,7 @@ def of_snapshot(
     def columns(rows: IntArray) -> FloatArray:
         out = -(half.T @ half[:, rows])
         out[rows, np.arange(len(rows))] += precision[rows]
-        return out
+        return np.asarray(out)
 
     said = precision * deviation[among] - own @ moved
     diagonal = precision - np.einsum("ij,ij->j", half, half)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from pse_analysis.estimation.noise import Learnt, Noise
 from pse_analysis.estimation.robust import Judge, Protection, Suspicion
 from pse_analysis.estimation.square_root import carried
 from pse_analysis.estimation.start import begin
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.wls import WeightedLeastSquares, WlsSolution
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout, wrap
 from pse_analysis.vocabulary import Status
@@ -180,13 +180,25 @@ class GaussianFilter:
         try:
             update = self._update(prior, snapshot, rows, state.tuned, self.robustness.judge)
             refusals = np.zeros(m, dtype=np.int64)
-            refusals[rows] = np.where(update.found.inflation > 0, state.refusals[rows] + 1, 0)
+            # What contradicts and was believed all the same was not understood either.
+            refused = (update.found.inflation > 0) | (update.found.nis > robust.gate(len(rows))[0])
+            refusals[rows] = np.where(refused, state.refusals[rows] + 1, 0)
             status, detail = Status.OK, ""
             protection = self.robustness.protection
             if protection is not None and protection.latched(refusals, used):
-                update, refusals, status, detail = self._unlatch(
-                    prior, snapshot, rows, state.tuned, update, refusals, protection
-                )
+                cause = protection.cause(refusals[rows])
+                alone, told = begin(self._alone, snapshot)
+                if alone is None:
+                    update, refusals, status, detail = self._widen(
+                        prior, snapshot, rows, state.tuned, update, refusals, protection
+                    )
+                elif 2 * np.count_nonzero(told.findings[rows]) <= np.count_nonzero(refused):
+                    return self._restarted(state, snapshot, rows, update, alone, told, cause)
+                else:
+                    # Wrong meters stay wrong whatever the forecast says; ask again after a while.
+                    refusals[:] = 0
+                    detail = "the snapshot alone refuses most of them as well"
+                detail = f"{cause}: {detail}"
         except np.linalg.LinAlgError as error:
             return None, Info.nothing(
                 m, Status.DIVERGED, f"{error}: the filter starts again from least squares"
@@ -244,7 +256,52 @@ class GaussianFilter:
                 break
         return _Update(found, eta, tuned, passes, converged or self.observation.passes == 1)
 
-    def _unlatch(
+    @cached_property
+    def _alone(self) -> WeightedLeastSquares:
+        return WeightedLeastSquares(self.model.network, self.model.layout)
+
+    def _restarted(
+        self,
+        state: GaussianState,
+        snapshot: Snapshot,
+        rows: IntArray,
+        update: _Update,
+        alone: WlsSolution,
+        told: Info,
+        cause: str,
+    ) -> tuple[GaussianState, Info]:
+        """Start again from the snapshot alone; what was learnt about the noise is kept."""
+        columns = self.model.columns
+        again = self.begin(alone.x, alone.covariance()[np.ix_(columns, columns)], snapshot.time)
+        left_out = told.findings.astype(bool)
+        m = len(left_out)
+        innovation, deviation = np.full(m, np.nan), np.full(m, np.nan)
+        innovation[rows], deviation[rows] = update.innovation, np.sqrt(update.found.variance)
+        refusals = self._refused_again(rows, m)
+        kept = int(told.used.sum())
+        info = Info(
+            Status.RESTARTED,
+            alone.iterations,
+            alone.objective,
+            max(kept - len(columns), 0),
+            snapshot.available & snapshot.fresh,
+            innovation,
+            deviation,
+            # As if each of them were off by no more than its noise.
+            np.where(left_out, (alone.residual / snapshot.sigma) ** 2, 0.0),
+            f"{cause}: the filter starts again from this snapshot alone",
+        )
+        return replace(again, noise=state.noise, tuned=update.tuned, refusals=refusals), info
+
+    def _refused_again(self, rows: IntArray, m: int) -> IntArray:
+        """Refusals after a way out: a judge of whole snapshots is not given many more to lose."""
+        refusals = np.zeros(m, dtype=np.int64)
+        protection = self.robustness.protection
+        if protection is not None and self.robustness.judge is not robust.per_channel:
+            refusals[rows] = protection.patience - 1
+        return refusals
+
+    def _widen(
         self,
         prior: Prior,
         snapshot: Snapshot,
@@ -254,13 +311,10 @@ class GaussianFilter:
         refusals: IntArray,
         protection: Protection,
     ) -> tuple[_Update, IntArray, Status, str]:
-        """Widen the forecast and judge by channel; kept if it clears half of the refused channels.
+        """Widen the forecast where a snapshot alone is not enough, and judge by channel.
 
-        Wrong meters stay wrong whatever the forecast says.
+        Kept if it clears half of the refused channels.
         """
-        patience = protection.patience
-        stuck = int(np.count_nonzero(refusals >= patience))
-        cause = f"{stuck} of {len(rows)} channels were refused {patience} times in a row"
         P = prior.P.copy()
         voltages = np.arange(prior.n)
         P[voltages, voltages] += protection.widening(refusals[rows])
@@ -268,13 +322,9 @@ class GaussianFilter:
             replace(prior, P=P, carried=None), snapshot, rows, tuned, robust.per_channel
         )
         if 2 * np.count_nonzero(widened.found.inflation) > np.count_nonzero(update.found.inflation):
-            return update, refusals, Status.OK, f"{cause}: a wider forecast does not clear them"
-        # A judge that refuses whole snapshots is not given another `patience` of them to lose.
-        again = np.zeros_like(refusals)
-        if self.robustness.judge is not robust.per_channel:
-            again[rows] = patience - 1
-        detail = f"{cause}: the forecast was widened, which cleared most of them"
-        return widened, again, Status.RESTARTED, detail
+            return update, refusals, Status.OK, "a wider forecast does not clear them"
+        again = self._refused_again(rows, len(refusals))
+        return widened, again, Status.RESTARTED, "the forecast was widened, which cleared most"
 
 
 def _through(transition: FloatArray, root: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from pse_analysis.estimation.deletion import of_snapshot
 from pse_analysis.estimation.estimator import Info, Snapshot
 from pse_analysis.estimation.robust import FAR, gate
 from pse_analysis.estimation.wls import WeightedLeastSquares, WlsSolution
+from pse_analysis.measurement import wrap
 from pse_analysis.vocabulary import Reason, Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -74,6 +75,8 @@ def robust_wls(
         if not solution.converged or (left_out == before).all():
             break
         x = solution.x
+    if not _credible(wls, solution.x):
+        solution = replace(solution, converged=False)
     residual = np.where(available, wls.model.residual(z, solution.x), np.nan)
     return replace(solution, residual=residual), left_out
 
@@ -115,6 +118,15 @@ def _solve_rest(
             if not out.any():
                 raise
             out[int(np.where(out, unseen, -np.inf).argmax())] = False
+
+
+def _credible(wls: WeightedLeastSquares, x: FloatArray) -> bool:
+    """Whether voltages are between half and one and a half, and branches are statically stable."""
+    network = wls.network
+    n, branches = network.n_bus, network.branches
+    across = wrap(x[branches.from_bus] - x[branches.to_bus] - branches.shift_rad)
+    steep = branches.in_service & (np.abs(across) > 0.5 * np.pi)
+    return not steep.any() and bool((np.abs(x[n:] - 1.0) < 0.5).all())
 
 
 def begin(wls: WeightedLeastSquares, snapshot: Snapshot) -> tuple[WlsSolution | None, Info]:

@@ -29,7 +29,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 
-COARSE = 1e-4
+COARSE = 1e-2
 """Largest step of a converged state whose rows are weighed by their residuals. [rad, p.u.]"""
 
 
