@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pse_analysis.estimation.estimator import Estimator, Snapshot
+from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, run
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import scalar_noise
 from pse_analysis.grid import library
@@ -166,3 +166,22 @@ def test_state_that_is_not_positive_asks_for_a_new_start() -> None:
     assert after is None
     assert info.status is Status.DIVERGED
     assert "not positive definite" in info.detail
+
+
+def test_filter_that_diverged_starts_again_from_least_squares() -> None:
+    b = bench()
+
+    def step(state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
+        lost = snapshot.time == b.snapshot(3).time
+        return b.filter.step(
+            dataclasses.replace(state, P=-1e3 * state.P) if lost else state, snapshot
+        )
+
+    spoilt = b.filter._replace(step=step)
+    taken = (b.snapshot(k) for k in range(8))
+    got = run(spoilt, taken, b.network, b.layout)
+    assert got.steps["status"].tolist() == ["ok"] * 3 + ["diverged"] + ["ok"] * 4
+    value = got.estimated["value"].to_numpy().reshape(8, -1)
+    assert np.isnan(value[3]).all()
+    begun = b.filter.read(b.filter.init(b.snapshot(4))[0]).x
+    np.testing.assert_allclose(value[4, b.network.n_bus :], begun[b.network.n_bus :])
