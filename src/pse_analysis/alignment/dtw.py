@@ -7,9 +7,9 @@ A window of the device's current and of its partner's, both z-scored, is matched
 warping inside a causal band, eqs. (1)–(2) of [qi2025] with the absolute difference that eq. (1)
 misprints as a root. The path of least cost follows every wiggle of the noise; it is better with a
 price on leaving the diagonal, but it still cannot tell where it is right. So it is weighed against
-the posterior of the delays (`pse_analysis.alignment.delays`), by how far the two have been apart.
-The spread of that posterior, relative to that of a delay about which nothing is known, is the
-confidence; where there is too little of it the device's usual delay, the lag of the largest
+the posterior of the delays (`pse_analysis.alignment.following`), by how far the two have been
+apart. The spread of that posterior, relative to that of a delay about which nothing is known, is
+the confidence; where there is too little of it the device's usual delay, the lag of the largest
 cross-correlation, stands instead.
 """
 
@@ -23,7 +23,8 @@ import numpy.typing as npt
 from dtaidistance import dtw_cc
 from dtaidistance.dtw import DTWSettings
 
-from pse_analysis.alignment import delays, lag
+from pse_analysis.alignment import lag
+from pse_analysis.alignment.following import Device, follow
 from pse_analysis.alignment.lag import Band, Reference
 from pse_analysis.errors import ParameterError
 
@@ -230,9 +231,8 @@ def recover(
     stamps.method[believed] = XCORR
     if method == "xcorr":
         return stamps
-    mean, spread = delays.follow(
-        arrival, value, sigma, reference, band, usual, believed, instants, params.lag_window_s
-    )
+    device = Device(arrival, value, sigma, reference, band)
+    mean, spread = follow(device, usual, believed, instants, params.lag_window_s)
     path = _paths(arrival, value, reference, instants, params)
     apart = _apart(path - mean, np.searchsorted(arrival, instants, side="right"))
     share = np.where(np.isfinite(path) & (apart > 0), spread**2 / (spread**2 + apart**2), 0.0)
