@@ -31,6 +31,7 @@ from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import RectangularModel, SensorLayout
+from pse_analysis.measurement.rectangular import Memo
 from pse_analysis.vocabulary import Reason, Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,8 +42,6 @@ IntArray = npt.NDArray[np.int64]
 REFINE_PU = 1e-3
 """The measurements are transformed again if an update moves a voltage by more than this. [p.u.]"""
 MAX_PASSES = 3
-PATTERNS = 256
-"""Sets of functionals of which the rows are kept: the same channels report again and again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,9 @@ class KalmanFilter:
             np.minimum(self.model.partner, np.arange(len(layout))),
             np.arange(len(layout)),
         )
-        self._patterns: dict[bytes, Functionals] = {}
+        # The same channels report again and again, often at the same age.
+        self._functionals: Memo[Functionals] = Memo()
+        self._reaches: Memo[Reach] = Memo()
 
     def walk(
         self, memory: Matched | None, x: FloatArray, time: np.datetime64
@@ -225,21 +226,25 @@ class KalmanFilter:
         wanted[first] = True
         number = np.cumsum(wanted) - 1
         key = wanted.tobytes()
-        if key not in self._patterns:
-            if len(self._patterns) >= PATTERNS:
-                self._patterns.clear()
-            self._patterns[key] = Functionals(self.model.functionals[wanted])
-        functionals = self._patterns[key]
+        functionals = self._functionals.get(
+            key, lambda: Functionals(self.model.functionals[wanted])
+        )
         reach: Reach | None = None
         moving: FloatArray | float = 1.0
         if not self.instant:
-            ages, windows, kind = intervals.kinds(age[wanted], window[wanted])
-            between = ages, windows, self.step_s, self.lagged.lags
-            bridge = intervals.bridge_covariance(*between)
-            reach = Reach(intervals.weights(*between)[kind], bridge[kind[:, None], kind])
+            ages = age[wanted]
+            reach = self._reaches.get(
+                key + ages.tobytes(), lambda: self._reach(ages, window[wanted])
+            )
             moving = reach.moving
         expected = self.lagged.expect(belief, prior, noise, functionals, reach)
         return Readings(number[first], expected, functionals.plane, moving)
+
+    def _reach(self, age_s: FloatArray, window_s: FloatArray) -> Reach:
+        ages, windows, kind = intervals.kinds(age_s, window_s)
+        between = ages, windows, self.step_s, self.lagged.lags
+        bridge = intervals.bridge_covariance(*between)
+        return Reach(intervals.weights(*between)[kind], bridge[kind[:, None], kind])
 
 
 def kalman_filter(

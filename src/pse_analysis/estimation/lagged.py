@@ -263,11 +263,17 @@ class Lagged:
 
 def turned(own: FloatArray, turn: ComplexArray, group: IntArray) -> FloatArray:
     """Covariance of real rows Re(conj(turn_i) c_i), c_i being functional number group_i. (m, m)"""
-    k = len(own) // 2
-    re, im = turn.real[:, None], turn.imag[:, None]
-    rows = re * own[group] + im * own[k + group]
-    across = np.ascontiguousarray(rows.T)
-    return np.asarray(re * across[group] + im * across[k + group])
+    return turned_rows(turned_rows(own, turn, group).T.copy(), turn, group)
+
+
+def turned_rows(functionals: FloatArray, turn: ComplexArray, group: IntArray) -> FloatArray:
+    """Re(conj(turn_i) c_i) of what stands for the real and imaginary parts of c. (m, …)"""
+    out = functionals.take(group, axis=0)
+    out *= turn.real[:, None]
+    other = functionals.take(group + len(functionals) // 2, axis=0)
+    other *= turn.imag[:, None]
+    out += other
+    return out
 
 
 def less(P: FloatArray, X: FloatArray) -> FloatArray:

@@ -148,23 +148,22 @@ class Sensitivity:
 def to_rectangular(voltage: ComplexArray) -> FloatArray:
     """∂[e; f]/∂[θ; |V|] at a voltage. (2N, 2N)"""
     direction = voltage / np.abs(voltage)
-    return np.block(
-        [
-            [np.diag(-voltage.imag), np.diag(direction.real)],
-            [np.diag(voltage.real), np.diag(direction.imag)],
-        ]
-    )
+    return _diagonals(-voltage.imag, direction.real, voltage.real, direction.imag)
 
 
 def to_polar(voltage: ComplexArray) -> FloatArray:
     """∂[θ; |V|]/∂[e; f] at a voltage. (2N, 2N)"""
     size = np.abs(voltage)
-    return np.block(
-        [
-            [np.diag(-voltage.imag / size**2), np.diag(voltage.real / size**2)],
-            [np.diag(voltage.real / size), np.diag(voltage.imag / size)],
-        ]
-    )
+    direction = voltage / size
+    return _diagonals(-direction.imag / size, direction.real / size, direction.real, direction.imag)
+
+
+def _diagonals(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+    """[[diag a, diag b], [diag c, diag d]]."""
+    n = len(a)
+    out, i = np.zeros((2 * n, 2 * n)), np.arange(n)
+    out[i, i], out[i, n + i], out[n + i, i], out[n + i, n + i] = a, b, c, d
+    return out
 
 
 def load_noise(network: Network, statistics: LoadStatistics) -> ProcessNoise:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
-from pse_analysis.estimation.lagged import Expected, less, turned
+from pse_analysis.estimation.lagged import Expected, less, turned, turned_rows
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -89,10 +89,7 @@ def gained(readings: Readings, innovation: Innovation) -> FloatArray:
 def conditioned(P: FloatArray, readings: Readings, innovation: Innovation) -> FloatArray:
     """P - K S Kᵀ = P - X Xᵀ with X = Cᵀ Tᵀ L⁻ᵀ, a symmetric product, in the place of P."""
     group, expected = readings.group, readings.expected
-    k = len(expected.mean) // 2
-    turn = innovation.turn
-    cross = turn.real[:, None] * expected.cross[group]
-    cross += turn.imag[:, None] * expected.cross[k + group]
+    cross = turned_rows(expected.cross, innovation.turn, group)
     X = blas.dtrsm(1.0, innovation.chol_S, cross.T, side=1, lower=1, trans_a=1, overwrite_b=1)
     return less(P, X)
 
@@ -101,15 +98,12 @@ def responses(
     shapes: tuple[FloatArray, ...], readings: Readings, innovation: Innovation
 ) -> FloatArray:
     """L⁻¹ D_k L⁻ᵀ of rows in their frames, where D_k = ∂S/∂θ_k. (c, m, m)"""
-    group, turn = readings.group, innovation.turn[:, None]
-    k = len(readings.plane) // 2
-    moving = readings.moving
+    group, moving = readings.group, readings.moving
     if isinstance(moving, np.ndarray):
         moving = moving[group[:, None], group]
     out = []
     for half in shapes:
-        carried = readings.plane @ half
-        rows = turn.real * carried[group] + turn.imag * carried[k + group]
+        rows = turned_rows(readings.plane @ half, innovation.turn, group)
         left, _ = lapack.dtrtrs(innovation.chol_S, moving * (rows @ rows.T), lower=1)
         out.append(lapack.dtrtrs(innovation.chol_S, left.T, lower=1)[0])
     return np.array(out)

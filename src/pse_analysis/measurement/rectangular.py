@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +27,7 @@ from pse_analysis.measurement.layout import (
 )
 
 BoolArray = npt.NDArray[np.bool_]
+Kept = TypeVar("Kept")
 
 
 class RectangularModel:
@@ -67,6 +70,7 @@ class RectangularModel:
         self._size = np.isin(quantity, (VM, IM))
         self._sign = np.where(quantity == Q, -1.0, 1.0)
         self._across = np.where(np.isin(quantity, (VA, IA, Q)), 1j, 1.0)
+        self._patterns: Memo[Pattern] = Memo()
 
     def paired(self, available: BoolArray) -> BoolArray:
         """Rows that are available together with the other half of their phasor or power. (m,)"""
@@ -87,30 +91,34 @@ class RectangularModel:
             Rows that are wanted, which are available; all if not given.
         """
         rows = np.arange(len(self.layout)) if rows is None else rows
-        partner = self.partner[rows]
-        paired = (partner >= 0) & available[partner]
-        value, spread = z[rows], sigma[rows]
-        is_angle, is_size = self._angle[rows], self._size[rows]
-        known = is_angle | (is_size & paired)
-        other = z[partner]
+        paired = self.paired(available)[rows]
+        pattern = self._patterns.get(
+            rows.tobytes() + paired.tobytes(), lambda: self._pattern(rows, paired)
+        )
+        value, spread, other = z[rows], sigma[rows], z[self.partner[rows]]
         unit = np.ones(len(rows), dtype=np.complex128)
-        unit[known] = np.exp(1j * np.where(is_angle, value, other)[known])
-        both = is_angle & paired
-        spread[both] *= np.maximum(np.abs(other[both]), RELATIVE_FLOOR_PU)
+        measured = np.where(pattern.is_angle, value, other)[pattern.known]
+        unit[pattern.known] = np.exp(1j * measured)
+        spread[pattern.both] *= np.maximum(np.abs(other[pattern.both]), RELATIVE_FLOOR_PU)
+        return Frame(pattern, unit, pattern.sign * value, spread)
+
+    def _pattern(self, rows: IntArray, paired: BoolArray) -> Pattern:
+        is_angle, is_size = self._angle[rows], self._size[rows]
         power = np.flatnonzero(~(is_angle | is_size))
-        linear = np.where(is_size, value, 0.0)
-        linear[power] = self._sign[rows[power]] * value[power]
-        return Frame(
-            self,
-            rows,
+        lone_size = np.flatnonzero(is_size & ~paired)
+        lone_angle = np.flatnonzero(is_angle & ~paired)
+        return Pattern(
             self._across[rows],
-            unit,
-            linear,
-            spread,
+            np.where(is_angle, 0.0, self._sign[rows]),
+            is_angle,
+            np.flatnonzero(is_angle | (is_size & paired)),
+            np.flatnonzero(is_angle & paired),
             power,
             self._metered[rows[power]],
-            np.flatnonzero(is_size & ~paired),
-            np.flatnonzero(is_angle & ~paired),
+            lone_size,
+            self.functionals[rows[lone_size]],
+            lone_angle,
+            self.functionals[rows[lone_angle]],
         )
 
     def rows(
@@ -143,36 +151,55 @@ class RectangularModel:
         return sparse.csr_array(np.hstack([w.real, -w.imag])), linear, spread
 
 
+class Pattern(NamedTuple):
+    """What is common to all frames of the same rows with the same partners.
+
+    Attributes
+    ----------
+    across : (r,) ndarray of complex
+        1 for a row along its direction, j for one across it.
+    sign : (r,) ndarray
+        Of the value in z: -1 for Q, 0 for an angle, which lies across what it measures.
+    is_angle : (r,) ndarray of bool
+    known, both, power, lone_size, lone_angle : ndarray of int
+        Places of rows whose direction is measured, of angles with a magnitude, of powers, of
+        magnitudes without an angle and of angles without a magnitude.
+    metered : ndarray of int
+        Buses of the powers.
+    size_of, angle_of : (…, N) ndarray of complex
+        Functionals of the magnitudes and the angles that are alone.
+    """
+
+    across: ComplexArray
+    sign: FloatArray
+    is_angle: BoolArray
+    known: IntArray
+    both: IntArray
+    power: IntArray
+    metered: IntArray
+    lone_size: IntArray
+    size_of: ComplexArray
+    lone_angle: IntArray
+    angle_of: ComplexArray
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """Rows of the linear form in so far as they do not depend on the predicted voltage.
 
     Attributes
     ----------
-    model : RectangularModel
-    rows : (r,) ndarray of int
-    across : (r,) ndarray of complex
-        1 for a row along its direction, j for one across it.
+    pattern : Pattern
     unit : (r,) ndarray of complex
         e^{jα} of the direction where it is measured.
     linear, spread : (r,) ndarray
         z and σ, those of powers still to be divided by |V|.
-    power, metered : (p,) ndarray of int
-        Places of powers in these rows, and their buses.
-    lone_size, lone_angle : ndarray of int
-        Places of magnitudes that lack an angle, and of angles that lack a magnitude.
     """
 
-    model: RectangularModel
-    rows: IntArray
-    across: ComplexArray
+    pattern: Pattern
     unit: ComplexArray
     linear: FloatArray
     spread: FloatArray
-    power: IntArray
-    metered: IntArray
-    lone_size: IntArray
-    lone_angle: IntArray
 
     def at(self, voltage: ComplexArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
         """The rest, at a predicted voltage.
@@ -188,20 +215,37 @@ class Frame:
             Row i reads Re(conj(turn_i) c_i), where c = ``model.functionals`` V.
         z_linear, sigma_linear : (r,) ndarray
         """
+        pattern = self.pattern
         unit, linear, spread = self.unit.copy(), self.linear.copy(), self.spread.copy()
-        at_meter = voltage[self.metered]
+        at_meter = voltage[pattern.metered]
         level = np.abs(at_meter)
-        unit[self.power] = at_meter / level
-        linear[self.power] /= level
-        spread[self.power] /= level
-        if len(self.lone_size):
-            predicted = self.model.functionals[self.rows[self.lone_size]] @ voltage
+        unit[pattern.power] = at_meter / level
+        linear[pattern.power] /= level
+        spread[pattern.power] /= level
+        if len(pattern.lone_size):
+            predicted = pattern.size_of @ voltage
             size = np.abs(predicted)
-            unit[self.lone_size] = np.where(size > 0, predicted, 1.0) / np.where(size > 0, size, 1)
-        if len(self.lone_angle):
-            size = np.abs(self.model.functionals[self.rows[self.lone_angle]] @ voltage)
-            spread[self.lone_angle] *= np.maximum(size, RELATIVE_FLOOR_PU)
-        return unit * self.across, linear, spread
+            unit[pattern.lone_size] = np.where(size > 0, predicted, 1) / np.where(size > 0, size, 1)
+        if len(pattern.lone_angle):
+            size = np.abs(pattern.angle_of @ voltage)
+            spread[pattern.lone_angle] *= np.maximum(size, RELATIVE_FLOOR_PU)
+        return unit * pattern.across, linear, spread
+
+
+class Memo(Generic[Kept]):
+    """What was made for a few hundred keys; all of it is forgotten when there are more."""
+
+    def __init__(self, most: int = 256) -> None:
+        self._most = most
+        self._made: dict[bytes, Kept] = {}
+
+    def get(self, key: bytes, make: Callable[[], Kept]) -> Kept:
+        """What belongs to a key, made if it is new."""
+        if key not in self._made:
+            if len(self._made) >= self._most:
+                self._made.clear()
+            self._made[key] = make()
+        return self._made[key]
 
 
 def _partners(layout: SensorLayout) -> IntArray:
