@@ -16,9 +16,11 @@ from scipy import sparse
 from scipy.linalg import blas
 
 from pse_analysis.estimation.holt import Process
+from pse_analysis.measurement.rectangular import Memo
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
 
 
@@ -95,7 +97,7 @@ class Functionals:
         row, column = np.nonzero(self.plane)
         self._value, self._functional = self.plane[row, column], row % max(len(y), 1)
         self._row, self._column = row, column
-        self._pattern: dict[tuple[int, int], sparse.csr_array] = {}
+        self._patterns: Memo[tuple[BoolArray, sparse.csr_array]] = Memo()
 
     def __len__(self) -> int:
         return len(self.plane) // 2
@@ -105,19 +107,18 @@ class Functionals:
 
         What an earlier call returned is written over.
         """
-        blocks = share.shape[1]
-        used = int(np.flatnonzero(share.any(axis=0)).max(initial=0)) + 1
-        data = (self._value[:, None] * share[self._functional, :used]).ravel()
-        if (blocks, used) not in self._pattern:
-            m, n = self.plane.shape
-            column = (self._column[:, None] + n * np.arange(used)).ravel()
-            ends = np.concatenate([[0], used * np.cumsum(np.bincount(self._row, minlength=m))])
-            self._pattern[blocks, used] = sparse.csr_array(
-                (data, column, ends), shape=(m, blocks * n)
-            )
-        rows = self._pattern[blocks, used]
-        rows.data = data
+        kept, rows = self._patterns.get((share != 0).tobytes(), lambda: self._laid_out(share != 0))
+        rows.data = (self._value[:, None] * share[self._functional])[kept]
         return rows
+
+    def _laid_out(self, reached: BoolArray) -> tuple[BoolArray, sparse.csr_array]:
+        """Which entries of which blocks there are, and the rows that they make."""
+        (m, n), blocks = self.plane.shape, reached.shape[1]
+        kept = reached[self._functional]
+        column = (self._column[:, None] + n * np.arange(blocks))[kept]
+        count = np.bincount(self._row, weights=kept.sum(axis=1), minlength=m)
+        ends = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        return kept, sparse.csr_array((np.ones(len(column)), column, ends), shape=(m, blocks * n))
 
 
 @dataclass(frozen=True, eq=False)
