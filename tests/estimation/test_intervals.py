@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pse_analysis.estimation.intervals import bridge_covariance, covered, weights
+from pse_analysis.estimation.intervals import bridge_covariance, covered, kinds, weights
 
 SEED = 17
 STEP_S = 300.0
@@ -107,3 +107,12 @@ def test_weights_and_bridge_give_the_statistics_of_brownian_paths() -> None:
     across = left.T @ states / paths  # what is left out is independent of the states themselves
     error = np.sqrt(np.outer(size, states.var(axis=0)) / paths)
     assert (np.abs(across) < 4.5 * error).all()
+
+
+def test_kinds_give_every_sample_its_own_interval_back() -> None:
+    rng = np.random.default_rng(SEED)
+    age, window = rng.choice([0.0, 7.5, 60.0], 40), rng.choice([0.0, 900.0], 40)
+    ages, windows, kind = kinds(age, window)
+    assert len(ages) == len(windows) == len(set(zip(age, window, strict=True)))
+    np.testing.assert_array_equal(ages[kind], age)
+    np.testing.assert_array_equal(windows[kind], window)

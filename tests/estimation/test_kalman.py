@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
-from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, run
+from pse_analysis import parameters
+from pse_analysis.estimation import Method, build
+from pse_analysis.estimation.estimator import Estimator, Info, Record, Snapshot, run
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import scalar_noise
 from pse_analysis.grid import library
@@ -185,3 +188,30 @@ def test_filter_that_diverged_starts_again_from_least_squares() -> None:
     assert np.isnan(value[3]).all()
     begun = b.filter.read(b.filter.init(b.snapshot(4))[0]).x
     np.testing.assert_allclose(value[4, b.network.n_bus :], begun[b.network.n_bus :])
+
+
+@pytest.mark.parametrize("process", ["random_walk", "holt", "local_trend"])
+@pytest.mark.parametrize("reading", ["interval", "instant"])
+def test_filter_of_a_case_file_forecasts_and_estimates_its_noise(
+    process: str, reading: str
+) -> None:
+    b = bench()
+    data = {
+        "name": "kf", "filter": "kalman", "noise": "innovation", "reading": reading,
+        "screening": "innovation", "compose": {"process": process},
+    }  # fmt: skip
+    method = parameters.build(Method, data, "estimate.methods")
+    study = parameters.Study(
+        datetime(2016, 6, 9, tzinfo=UTC), datetime(2016, 6, 10, tzinfo=UTC), STEP_S
+    )
+    m = len(b.layout)
+    no, off = np.zeros((0, m)), np.zeros((0, m), dtype=bool)
+    history = Record(np.zeros(0, dtype="datetime64[us]"), no, no, no, off, off, no)
+    made = build(method, b.network, b.layout, study, history)
+    state, _ = made.init(b.snapshot(0))
+    assert len(state.x) == 2 * b.network.n_bus * (2 if process == "local_trend" else 1)
+    for k in range(1, 12):
+        state, info = made.step(state, b.snapshot(k))
+        assert info.status is Status.OK
+    assert (state.noise.level != made.init(b.snapshot(0))[0].noise.level).any()
+    assert np.abs(made.read(state).x - b.truth).max() < 5e-3
