@@ -1,72 +1,98 @@
 """Claim: bad data cost a screened filter less than half of what they cost a plain one.
 
-Table 3 of [qi2025], on smooth aggregated load and a clean history, for the mean |V| error.
+Table 3 of [qi2025]: smooth aggregated load, ±5 % on a share of all samples, a clean day of history.
+Two seeds and half a day, for the time that they take.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from datetime import timedelta
 
+import pandas as pd
 import pytest
-from simulated_case import curves, feeder
 
-from pse_analysis.alignment import align
-from pse_analysis.estimation import estimate
 from pse_analysis.pipeline.case import load_case
+from pse_analysis.pipeline.monte_carlo import monte_carlo
 from pse_analysis.pipeline.stages import check_case
-from pse_analysis.scoring import errors
-from pse_analysis.simulation import simulate
 from pse_analysis.simulation.settings import FaultParams, LoadParams, LoadStepParams
-from pse_analysis.validation import validate
 
-SEED = 401
-SHARE = 0.10
+SEEDS = (401, 402)
+SHARES = (0.0, 0.05, 0.10)
+SCREENED = ("scaled", "innovation")
 
 
-@cache
-def mean_errors(share: float) -> dict[str, float]:
-    """Mean |V| error by screening. [p.u.]"""
-    case = check_case(load_case("qi2025"))
-    study = replace(case.study, history_s=86400.0)
-    faults = (FaultParams("spike", share, (0.05, 0.05), relative=True, start=study.start),)
-    params = replace(
-        case.simulate,
-        seed=SEED,
-        faults=faults if share else (),
+@pytest.fixture(scope="module")
+def errors() -> pd.DataFrame:
+    """Mean over the seeds, by share and screening; metrics in columns."""
+    settings = check_case(load_case("qi2025"))
+    start = settings.study.start
+    study = replace(settings.study, end=start + timedelta(hours=12), history_s=86400.0)
+    plain = next(m for m in settings.estimate.methods if m.name == "ekf")
+    # Without the recovery of stamps, which takes longest and has nothing to do with the claim.
+    tried = tuple(
+        replace(plain, name=screening, screening=screening, variant="none_pseudo")  # type: ignore[arg-type]
+        for screening in ("none", *SCREENED)
+    )
+    smooth = replace(
+        settings.simulate,
         load=LoadParams(per_bus=14, concentration=10.0),
         load_steps=LoadStepParams(),
-        source_voltage=replace(case.simulate.source_voltage, taps_per_day=0.0),
+        source_voltage=replace(settings.simulate.source_voltage, taps_per_day=0.0),
         pv=(),
     )
-    raw = simulate(feeder(), curves(), study, params)
-    validated = validate(raw.telemetry, raw.channels, case.validate, history_end=study.start)
-    variants = tuple(v for v in case.align.variants if v.name == "none_pseudo")
-    aligned = align(
-        validated, raw.channels, feeder(), study, replace(case.align, variants=variants)
-    )
-    plain = next(m for m in case.estimate.methods if m.name == "ekf")
-    out = {}
-    for screening in ("none", "scaled", "innovation"):
-        method = replace(plain, screening=screening, variant="none_pseudo")
-        done = estimate(aligned, raw.channels, feeder(), study, method)
-        scores = errors.of_states(
-            errors.against_truth(done.estimated, raw.truth), by_element=False
-        ).set_index("metric")
-        out[screening] = float(scores.loc["vm_error_mean", "value"])
-    return out
+    worlds = {}
+    for share in SHARES:
+        bad = FaultParams("spike", share, (0.05, 0.05), relative=True, start=start)
+        worlds[f"{share:.0%}"] = replace(
+            settings,
+            study=study,
+            simulate=replace(smooth, faults=(bad,) if share else ()),
+            estimate=replace(settings.estimate, methods=tried),
+        )
+    table = monte_carlo("ieee33", worlds, SEEDS, workers=1)
+    return table.pivot_table(index=["world", "method"], columns="metric", values="value")
 
 
-@pytest.mark.parametrize("screening", ["scaled", "innovation"])
-def test_error_grows_by_less_than_half(screening: str):
-    clean, bad = mean_errors(0.0), mean_errors(SHARE)
-    growth = {name: bad[name] / clean[name] - 1.0 for name in clean}
+@pytest.mark.parametrize("screening", SCREENED)
+def test_without_bad_data_screening_changes_the_errors_by_less_than_two_per_cent(
+    errors: pd.DataFrame, screening: str
+):
+    ratio = errors.loc[("0%", screening)] / errors.loc[("0%", "none")]
+    # The largest angle error is one bus at one instant and may be another one: 5 % of it.
+    for metric, most in {
+        "vm_error_mean": 0.02,
+        "vm_error_max": 0.02,
+        "va_error_mean": 0.02,
+        "va_error_max": 0.05,
+    }.items():
+        assert abs(ratio[metric] - 1.0) < most, metric
+
+
+@pytest.mark.parametrize("share", ["5%", "10%"])
+@pytest.mark.parametrize("screening", SCREENED)
+def test_error_grows_by_less_than_half(errors: pd.DataFrame, screening: str, share: str):
+    growth = errors["vm_error_mean"].unstack(0)
+    growth = growth[share] / growth["0%"] - 1.0
     assert growth["none"] > 0.5
     assert growth[screening] < 0.5 * growth["none"]
-    assert bad[screening] < bad["none"]
 
 
-@pytest.mark.parametrize("screening", ["scaled", "innovation"])
-def test_without_bad_data_screening_changes_the_error_by_less_than_two_per_cent(screening: str):
-    clean = mean_errors(0.0)
-    assert abs(clean[screening] / clean["none"] - 1.0) < 0.02
+@pytest.mark.parametrize("share", ["5%", "10%"])
+@pytest.mark.parametrize("screening", SCREENED)
+def test_with_bad_data_screening_is_better_in_voltage_and_no_worse_in_angle(
+    errors: pd.DataFrame, screening: str, share: str
+):
+    screened, plain = errors.loc[(share, screening)], errors.loc[(share, "none")]
+    assert screened["vm_error_mean"] < 0.7 * plain["vm_error_mean"]
+    assert screened["vm_error_max"] < plain["vm_error_max"]
+    # 5 % of a current or a power is what load moves in five minutes: none of it can be seen.
+    assert screened["va_error_mean"] < 1.02 * plain["va_error_mean"]
+
+
+@pytest.mark.parametrize("share", ["0%", "5%", "10%"])
+def test_innovation_is_at_least_as_good_as_a_threshold_per_channel(
+    errors: pd.DataFrame, share: str
+):
+    mean = errors["vm_error_mean"].loc[share]
+    assert mean["innovation"] < 1.01 * mean["scaled"]

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 from scipy import linalg
 
 from pse_analysis.errors import ParameterError
@@ -44,19 +45,24 @@ class InnovationParams:
         from what these and the forecast predict. Loads are heavy-tailed: where single customers
         switch, a good channel that alone sees a step lies 4 to 6 σ off, and to refuse it costs more
         than the few errors of that size do.
+    alone : float
+        Nor is a channel refused that lies less than so many of its own σ away from the forecast
+        alone: what only the others speak against rests on correlations that are learnt, of loads
+        and of values that are held, and these are not as certain as S has them.
     largest_share : float
         Share of the channels of a snapshot that may be refused: if more seem wrong, the forecast
         is.
     """
 
     factor: float = 6.0
+    alone: float = 2.5
     largest_share: float = 0.25
 
     def __post_init__(self) -> None:
-        if not (self.factor > 0 and 0 < self.largest_share < 1):
+        if not (self.factor > 0 and self.alone >= 0 and 0 < self.largest_share < 1):
             raise ParameterError(
-                "screening: expected factor > 0 and 0 < largest_share < 1, received "
-                f"{self.factor} and {self.largest_share}"
+                "screening: expected factor > 0, alone ≥ 0 and 0 < largest_share < 1, received "
+                f"{self.factor}, {self.alone} and {self.largest_share}"
             )
 
 
@@ -83,14 +89,17 @@ def refuse(params: InnovationParams | None = None) -> Refuse:
     def refused(innovation: FloatArray, chol_S: FloatArray) -> BoolArray:
         m = len(innovation)
         out = np.zeros(m, dtype=bool)
+        own_variance = np.einsum("ij,ij->i", chol_S, chol_S)
+        expected = innovation**2 <= params.alone**2 * own_variance
         inverse, _ = linalg.lapack.dtrtri(chol_S, lower=1)
         y = inverse.T @ (inverse @ innovation)
         # Most snapshots hold no error: the diagonal of M = L⁻ᵀL⁻¹ is enough to see that.
-        if not (y * y > params.factor**2 * np.einsum("ij,ij->j", inverse, inverse)).any():
+        odd = y * y > params.factor**2 * np.einsum("ij,ij->j", inverse, inverse)
+        if not (odd & ~expected).any():
             return out
         M = inverse.T @ inverse
         for _ in range(int(params.largest_share * m)):
-            variance = np.where(out, np.inf, np.diagonal(M))
+            variance = np.where(out | expected, np.inf, np.diagonal(M))
             suspicion = np.abs(y) / np.sqrt(variance)
             worst = int(suspicion.argmax())
             if suspicion[worst] <= params.factor:
@@ -147,13 +156,14 @@ def screened(
     """
     m = len(layout)
     turn = np.where(np.isin(layout.quantity, (VA, IA)), 2.0 * np.pi, np.inf)
+    kind = pd.factorize(pd.MultiIndex.from_arrays([layout.source, layout.quantity]))[0]
 
     def judged(
         state: ScreenedState, snapshot: Snapshot
     ) -> tuple[ScreenedState, Snapshot, npt.NDArray[np.int32]]:
         new = snapshot.available & snapshot.fresh
         own = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
-        past, decision = adaptive.step(state.past, snapshot.z, own, new, params, turn)
+        past, decision = adaptive.step(state.past, snapshot.z, own, new, params, turn, kind)
         replaced = np.where(new, decision.flagged, state.replaced)
         value = np.where(new, decision.value, state.value)
         sigma = np.where(new, decision.sigma, state.sigma)

@@ -21,7 +21,9 @@ missing sample.
 On a ramp the window would latch a channel to old values for ever, so a run of more than ``release``
 flagged samples that agree with each other becomes the window, and one of twice that length whether
 they agree or not. What is flagged is not learnt from, unless the next sample deviates to the same
-side: then the channel moved.
+side: then the channel moved. Nor is anything flagged where more than half of the channels of a kind
+deviate to one side at once, by half their thresholds at least: errors are independent, and it is
+the grid that moved.
 
 A step is a function of a state and one sample per channel; many at once are the same steps.
 """
@@ -35,7 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.validation import tails
+from pse_analysis.validation import tails, windows
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -57,7 +59,7 @@ MEMORY = 288
 RENEWAL = 8
 """Residuals after which the quantiles are taken again; so few hardly move them.
 
-Before the first of these times the meter's own σ is all there is.
+Before the first of these times a channel is not judged by ``scaled``.
 """
 
 
@@ -167,7 +169,7 @@ class Decision(NamedTuple):
     value, sigma : (m,) ndarray
         The sample and its σ, or the replacement and its larger σ.
     statistic, threshold : (m,) ndarray
-        |z - z₋₁| or |r|, and ξ; NaN before the window is full.
+        |z - z₋₁| or |r|, and ξ; NaN before there is a past to compare with.
     """
 
     flagged: BoolArray
@@ -185,6 +187,7 @@ def step(
     present: BoolArray,
     params: AdaptiveParams,
     turn: FloatArray | float = np.inf,
+    kind: IntArray | None = None,
 ) -> tuple[AdaptiveState, Decision]:
     """Judge one sample of each channel.
 
@@ -198,6 +201,8 @@ def step(
     params : AdaptiveParams
     turn : (m,) ndarray or float
         Full turn of channels that are angles, in their unit; inf for the others.
+    kind : (m,) ndarray of int, optional
+        Number of what the grid moves together, as all angles of one source; for ``scaled``.
 
     Returns
     -------
@@ -205,7 +210,7 @@ def step(
     decision : Decision
     """
     channel = np.arange(len(z))
-    z_near = _near(z, state.values[-1], turn)
+    z_near = windows.near(z, state.values[-1], turn)
     deviations = z_near - (AHEAD[:, :, None] * state.values[-SPAN:]).sum(axis=1)
     served = state.scores.argmin(axis=0)
     deviation = deviations[served, channel]
@@ -214,27 +219,33 @@ def step(
     noise = np.sqrt(sigma**2 + ((AHEAD[served].T * state.sigmas) ** 2).sum(axis=0))
     scaled = params.factor * np.maximum(noise, state.scale)
     if params.threshold == "scaled":
-        statistic, threshold = residual, np.where(np.isfinite(residual), scaled, np.nan)
+        # A channel is not judged by a past that it does not have yet.
+        judged = np.isfinite(residual) & (state.learnt >= RENEWAL)
+        statistic, threshold = residual, np.where(judged, scaled, np.nan)
     else:
         statistic, threshold = _printed(state.values, z_near, sigma, params)
     suspicious = present & (statistic > threshold)
+    if kind is not None and params.threshold == "scaled" and suspicious.any():
+        suspicious &= ~_together(
+            present & (residual > 0.5 * threshold), deviation > 0, present, kind
+        )
 
     accepted, value, wide = z_near, z, sigma
     suspects, run = state.suspects, np.where(present, 0, state.run)
     flagged = released = suspicious
     if suspicious.any():
-        suspects = _pushed(suspects, z_near, suspicious)
+        suspects = windows.pushed(suspects, z_near, suspicious)
         run = np.where(suspicious, state.run + 1, run)
         released = suspicious & (run > params.release)
         if released.any():
-            released &= _agree(suspects, scaled) | (run > 2 * params.release)
+            released &= windows.agree(suspects, scaled) | (run > 2 * params.release)
         flagged = suspicious & ~released
         replacement, least = _replacement(state.values, z_near, sigma, params)
         accepted, value = np.where(flagged, replacement, z_near), np.where(flagged, replacement, z)
         wide = np.where(flagged, least, sigma)
 
     known = present & np.isfinite(residual)
-    values = _pushed(state.values, accepted, present)
+    values = windows.pushed(state.values, accepted, present)
     scores = state.scores + np.where(known, RATE * (np.abs(deviations) - state.scores), 0.0)
     if released.any():
         values[:, released] = suspects[-len(values) :, released]
@@ -244,7 +255,7 @@ def step(
     )
     following = AdaptiveState(
         values,
-        _pushed(state.sigmas, sigma, present),
+        windows.pushed(state.sigmas, sigma, present),
         scores,
         recent,
         residuals,
@@ -265,6 +276,7 @@ def screen(
     *,
     present: BoolArray | None = None,
     turn: FloatArray | float = np.inf,
+    kind: IntArray | None = None,
 ) -> Decision:
     """Judge whole records, sample by sample.
 
@@ -276,7 +288,7 @@ def screen(
     params : AdaptiveParams, optional
     present : (n, m) ndarray of bool, optional
         Where there is a sample; by default where z is finite.
-    turn : (m,) ndarray or float
+    turn, kind
         As for `step`.
 
     Returns
@@ -290,20 +302,9 @@ def screen(
     state = AdaptiveState.empty(z.shape[1], params)
     decisions = []
     for row in range(len(z)):
-        state, decision = step(state, z[row], spread[row], here[row], params, turn)
+        state, decision = step(state, z[row], spread[row], here[row], params, turn, kind)
         decisions.append(decision)
     return Decision(*(np.array(part) for part in zip(*decisions, strict=True)))
-
-
-def _near(z: FloatArray, last: FloatArray, turn: FloatArray | float) -> FloatArray:
-    """Samples, with angles turned by whole turns to the last value of their channel."""
-    angle = np.isfinite(turn) & np.isfinite(last)
-    if not angle.any():
-        return z
-    full = np.broadcast_to(turn, z.shape)[angle]
-    near = z.copy()
-    near[angle] -= np.rint((z[angle] - last[angle]) / full) * full
-    return near
 
 
 def _printed(
@@ -320,19 +321,13 @@ def _printed(
         return difference[-1], sigma**2 * level / variance
 
 
-def _weighted(weight: npt.NDArray[np.floating], rows: FloatArray) -> FloatArray:
-    """Weighted sum of rows, added in one order however many columns there are."""
-    return np.asarray((weight[:, None] * rows).sum(axis=0))
-
-
-def _pushed(past: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
-    """The past with a new row at its end, in some columns."""
-    if where.all():
-        return np.concatenate([past[1:], new[None]])
-    out = past.copy()
-    out[:-1, where] = past[1:, where]
-    out[-1, where] = new[where]
-    return out
+def _together(off: BoolArray, above: BoolArray, present: BoolArray, kind: IntArray) -> BoolArray:
+    """Channels off to the side to which most of their kind are, and three at least."""
+    n = int(kind.max()) + 1
+    most = np.maximum(np.bincount(kind, present, n) / 2.0, 2.0)
+    up = np.bincount(kind, off & above, n) > most
+    down = np.bincount(kind, off & ~above, n) > most
+    return np.asarray(off & np.where(above, up[kind], down[kind]))
 
 
 def _replacement(
@@ -340,7 +335,7 @@ def _replacement(
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted mean of the window, eq. (24), and its σ."""
     weight = params.decay ** np.arange(params.window - 1)[::-1]
-    replacement = _weighted(weight, values[-(params.window - 1) :]) / weight.sum()
+    replacement = windows.weighted(weight, values[-(params.window - 1) :]) / weight.sum()
     wide = params.sigma_factor * sigma
     if params.threshold == "scaled":
         wide = np.maximum(wide, np.abs(z - replacement))
@@ -390,13 +385,3 @@ def _tried(suspects: FloatArray) -> FloatArray:
         for k in range(SPAN, len(suspects))
     ]
     return np.asarray(np.mean(ahead, axis=0))
-
-
-def _agree(suspects: FloatArray, bound: FloatArray) -> BoolArray:
-    """Whether the last run of each column lies within a bound about its own line."""
-    n = len(suspects)
-    time = np.arange(n) - 0.5 * (n - 1)
-    centred = suspects - suspects.mean(axis=0)
-    slope = _weighted(time, centred) / (time @ time)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(centred - np.outer(time, slope)) <= bound).all(axis=0))
