@@ -154,8 +154,8 @@ def to_rectangular(voltage: ComplexArray) -> FloatArray:
 def to_polar(voltage: ComplexArray) -> FloatArray:
     """∂[θ; |V|]/∂[e; f] at a voltage. (2N, 2N)"""
     size = np.abs(voltage)
-    direction = voltage / size
-    return _diagonals(-direction.imag / size, direction.real / size, direction.real, direction.imag)
+    along, across = voltage.real / size, voltage.imag / size
+    return _diagonals(-across / size, along / size, along, across)
 
 
 def _diagonals(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
