@@ -101,6 +101,12 @@ def test_with_constant_delay_it_is_no_worse_than_the_usual_delay_by_a_phasor_sam
     assert dtw_error <= usual_error + PMU_S
 
 
+@pytest.mark.parametrize(("kind", "expected"), [("constant", XCORR), ("drifting", DTW)])
+def test_a_delay_that_varies_is_told_from_one_that_does_not(kind: str, expected: int):
+    settled = device(kind=kind).arrival > SETTLED
+    assert (recovered(kind=kind).method[settled] == expected).mean() > 0.95
+
+
 def test_error_grows_as_confidence_falls():
     sure, error = [], []
     for seed in (4, 5):

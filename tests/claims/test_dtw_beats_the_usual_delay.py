@@ -97,6 +97,6 @@ def test_a_lateral_without_a_phasor_unit_in_series_is_left_alone():
 
 def test_with_a_constant_delay_it_is_no_worse_than_the_usual_delay_by_a_phasor_sample():
     table = recovered(constant=True)
-    sure = table[table["method"] == DTW]
-    assert len(sure) >= 0.5 * len(table)
-    assert rms(sure["dtw"]) <= rms(sure["xcorr"]) + PHASOR_S
+    table = table[~table["channel"].str.startswith(LATERAL)]
+    assert rms(table["xcorr"]) < PHASOR_S
+    assert rms(table["dtw"]) <= rms(table["xcorr"]) + PHASOR_S

@@ -10,7 +10,8 @@ price on leaving the diagonal, but it still cannot tell where it is right. So it
 the posterior of the delays (`pse_analysis.alignment.following`), by how far the two have been
 apart. The spread of that posterior, relative to that of a delay about which nothing is known, is
 the confidence; where there is too little of it the device's usual delay, the lag of the largest
-cross-correlation, stands instead.
+cross-correlation, stands instead. So it does for a device whose current is explained by its usual
+delay nearly as well as by the delays that were found: those are then held for noise.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ FEWEST_SAMPLES = 6
 """Samples that a window must hold for a match."""
 LAGS = 24
 """Steps into which the band is divided at least: a finer phasor current is averaged."""
+
+GAIN = 0.1
+"""Share of what the usual delay leaves unexplained that delays must explain to be believed."""
 
 Method = Literal["none", "xcorr", "dtw"]
 METHODS: tuple[Method, ...] = ("none", "xcorr", "dtw")
@@ -102,7 +106,8 @@ class Stamps:
     confidence : (n,) ndarray
         1 - (spread left)/(spread of a delay that may be anything in the band).
     method : (n,) ndarray of int8
-        What the delay rests on: index into `METHODS`.
+        What the delay rests on: index into `METHODS`. ``dtw`` wherever it is confident, but for a
+        device whose delay does not vary.
     """
 
     delay: FloatArray
@@ -234,13 +239,17 @@ def recover(
     device = Device(arrival, value, sigma, reference, band)
     mean, spread = follow(device, usual, believed, instants, params.lag_window_s)
     path = _paths(arrival, value, reference, instants, params)
-    apart = _apart(path - mean, np.searchsorted(arrival, instants, side="right"))
+    bounds = np.searchsorted(arrival, instants, side="right")
+    edges = np.concatenate([[0], bounds])
+    begin = edges[np.searchsorted(bounds, np.arange(n), side="right")]
+    apart = _apart(path - mean, begin)
+    varies = _varies(device, usual, np.where(np.isfinite(mean), mean, usual), begin, params)
     share = np.where(np.isfinite(path) & (apart > 0), spread**2 / (spread**2 + apart**2), 0.0)
     mean = mean + np.where(share > 0, share * (path - mean), 0.0)
     ignorant = params.largest_delay_s / np.sqrt(12.0)
     confidence = np.clip(1.0 - np.hypot(spread, 0.3 * reference.step) / ignorant, 0.0, 1.0)
     stamps.confidence[:] = np.where(believed & np.isfinite(mean), confidence, 0.0)
-    sure = (stamps.confidence >= params.least_confidence) & (stamps.confidence > 0)
+    sure = varies & (stamps.confidence >= params.least_confidence) & (stamps.confidence > 0)
     stamps.delay[sure] = mean[sure]
     stamps.method[sure] = DTW
     return stamps
@@ -280,16 +289,37 @@ def _paths(
     return path
 
 
-def _apart(difference: FloatArray, bounds: IntArray) -> FloatArray:
-    """RMS of the differences that were known before each sample's window; 0 while too few."""
+def _apart(difference: FloatArray, begin: IntArray) -> FloatArray:
+    """RMS of the differences of the samples before ``begin``; 0 while too few."""
     some = np.isfinite(difference)
     square = np.concatenate([[0.0], np.cumsum(np.where(some, difference, 0.0) ** 2)])
     count = np.concatenate([[0], np.cumsum(some)])
-    row = np.arange(len(difference))
-    edges = np.concatenate([[0], bounds])
-    begin = edges[np.searchsorted(bounds, row, side="right")]
     mean = square[begin] / np.maximum(count[begin], 1)
     return np.asarray(np.where(count[begin] >= lag.FEWEST, np.sqrt(mean), 0.0))
+
+
+def _varies(
+    device: Device, usual: FloatArray, found: FloatArray, begin: IntArray, params: TimeParams
+) -> npt.NDArray[np.bool_]:
+    """Whether the delays found explained a device better, before ``begin``, than its usual one."""
+    reference, known = device.reference, np.isfinite(device.value)
+    both = np.stack(
+        [
+            np.interp((device.arrival - delay)[known], reference.time, reference.value)
+            for delay in (usual, found)
+        ],
+        axis=1,
+    )
+    agreed = lag.correlations(
+        device.arrival[known],
+        device.value[known],
+        both,
+        params.largest_delay_s,
+        params.lag_window_s,
+    )
+    left = 1.0 - np.maximum(agreed, 0.0) ** 2
+    better = np.concatenate([[False], left[:, 1] < (1.0 - GAIN) * left[:, 0]])
+    return np.asarray(better[np.concatenate([[0], np.cumsum(known)])[begin]])
 
 
 def _path(device: FloatArray, other: FloatArray, radius: int, penalty: float) -> IntArray:

@@ -128,12 +128,44 @@ def usual_delay(
     over about the largest delay: over less, a delay that varies puts most movements of the two
     currents into different increments.
     """
-    lags, n = band.lags, len(arrival)
-    usual, found = np.zeros(n), np.full(n, -1.0)
-    span = span_of(arrival, float(lags[-1]))
-    if n <= span + FEWEST:
-        return usual, found
-    own, other = value[span:] - value[:-span], band.value[span:] - band.value[:-span]
+    lags = band.lags
+    found = correlations(arrival, value, band.value, float(lags[-1]), window_s)
+    # The peak of a parabola through the best lag and its neighbours.
+    row = np.arange(len(arrival))
+    middle = np.clip(found.argmax(axis=1), 1, len(lags) - 2)
+    left, centre, right = (found[row, middle + k] for k in (-1, 0, 1))
+    bend = left - 2 * centre + right
+    shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
+    usual = lags[middle] + np.clip(shift, -1.0, 1.0) * (lags[1] - lags[0])
+    best = found.max(axis=1)
+    return np.where(best > -1.0, usual, 0.0), best
+
+
+def correlations(
+    arrival: FloatArray, value: FloatArray, others: FloatArray, reach_s: float, window_s: float
+) -> FloatArray:
+    """Correlation of a device's increments so far with those of several series.
+
+    Parameters
+    ----------
+    arrival, value : (n,) ndarray
+        [s, any unit]
+    others : (n, k) ndarray
+        What the current may follow, at each sample.
+    reach_s, window_s : float
+        Time over which an increment reaches, at least from a sample to the next, and the past that
+        counts. [s]
+
+    Returns
+    -------
+    (n, k) ndarray
+        As known at each arrival; -1 while increments are too few.
+    """
+    out = np.full(others.shape, -1.0)
+    span = span_of(arrival, reach_s)
+    if len(arrival) <= span + FEWEST:
+        return out
+    own, other = value[span:] - value[:-span], others[span:] - others[:-span]
     # A load step is worth as much as a hundred quiet minutes, a meter's spike should not be.
     scale = 1.4826 * _running_median(np.abs(own)) + 1e-12
     own = np.clip(own, -6 * scale, 6 * scale)[:, None]
@@ -145,23 +177,16 @@ def usual_delay(
         return np.asarray(total[row] - total[begin])
 
     with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = past(own * other) / np.sqrt(past(own**2) * past(other**2))
+        found = past(own * other) / np.sqrt(past(own**2) * past(other**2))
     enough = (row - begin) >= FEWEST
-    correlation = np.where(enough[:, None] & np.isfinite(correlation), correlation, -1.0)
-    # The peak of a parabola through the best lag and its neighbours.
-    middle = np.clip(correlation.argmax(axis=1), 1, len(lags) - 2)
-    left, centre, right = (correlation[row - 1, middle + k] for k in (-1, 0, 1))
-    bend = left - 2 * centre + right
-    shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
-    usual[span:] = lags[middle] + np.clip(shift, -1.0, 1.0) * (lags[1] - lags[0])
-    found[span:] = correlation.max(axis=1)
-    return usual, found
+    out[span:] = np.where(enough[:, None] & np.isfinite(found), found, -1.0)
+    return out
 
 
-def span_of(arrival: FloatArray, largest_s: float) -> int:
-    """Samples over which an increment reaches about as far as the largest delay."""
+def span_of(arrival: FloatArray, reach_s: float) -> int:
+    """Samples over which an increment reaches about as far as asked."""
     first = np.diff(arrival[: FEWEST + 1])
-    return max(1, round(largest_s / float(np.median(first)))) if len(first) else 1
+    return max(1, round(reach_s / float(np.median(first)))) if len(first) else 1
 
 
 def _running_median(series: FloatArray) -> FloatArray:
