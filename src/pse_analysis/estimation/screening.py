@@ -91,6 +91,8 @@ def refuse(params: InnovationParams | None = None) -> Refuse:
         out = np.zeros(m, dtype=bool)
         own_variance = np.einsum("ij,ij->i", chol_S, chol_S)
         expected = innovation**2 <= params.alone**2 * own_variance
+        if expected.all():
+            return out
         inverse, _ = linalg.lapack.dtrtri(chol_S, lower=1)
         y = inverse.T @ (inverse @ innovation)
         # Most snapshots hold no error: the diagonal of M = L⁻ᵀL⁻¹ is enough to see that.
