@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy import linalg, sparse
+from scipy.linalg import blas
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -172,20 +173,22 @@ def of_snapshot(
         Of the k rows. Its M = R⁻¹ - R⁻¹H G⁻¹HᵀR⁻¹ knows each voltage to `FORGOTTEN` around x, which
         keeps G regular whatever is left out, and says next to nothing.
     """
-    weighted = sparse.csr_array(sparse.diags_array(1.0 / noise) @ H)
-    gain = (H.T @ weighted).toarray()
+    # Dense: for a few hundred rows the sparse products cost more in their making.
+    root = 1.0 / np.sqrt(noise)
+    whitened = H.toarray() * root[:, None]
+    gain = blas.dsyrk(1.0, whitened.T, lower=1)
     gain[np.diag_indices_from(gain)] += FORGOTTEN**-2
     factor = linalg.cholesky(gain, lower=True, overwrite_a=True, check_finite=False)
-    own = weighted[among]
-    half = linalg.solve_triangular(factor, own.toarray().T, lower=True, check_finite=False)
-    moved = linalg.cho_solve((factor, True), weighted.T @ deviation, check_finite=False)
-    precision = 1.0 / noise[among]
+    own, scale = whitened[among], root[among]
+    half = linalg.solve_triangular(factor, own.T, lower=True, check_finite=False)
+    white = root * deviation
+    moved = linalg.cho_solve((factor, True), white @ whitened, check_finite=False)
 
     def columns(rows: IntArray) -> FloatArray:
         out = -(half.T @ half[:, rows])
-        out[rows, np.arange(len(rows))] += precision[rows]
-        return np.asarray(out)
+        out[rows, np.arange(len(rows))] += 1.0
+        return np.asarray(scale[:, None] * out * scale[rows])
 
-    said = precision * deviation[among] - own @ moved
-    diagonal = precision - np.einsum("ij,ij->j", half, half)
+    said = scale * (white[among] - own @ moved)
+    diagonal = scale**2 * (1.0 - np.einsum("ij,ij->j", half, half))
     return Deletion(said, diagonal, columns, float(deviation[among] @ said))

@@ -136,14 +136,10 @@ def per_channel(found: Suspicion) -> FloatArray:
     total, largest = gate(len(eta))
     if found.nis <= total and (eta**2 <= largest * found.variance).all():
         return np.zeros(len(eta))
-    half, _ = lapack.dtrtri(found.chol_S, lower=1)
-    half = np.tril(half)
-    deletion = Deletion(
-        half.T @ (half @ eta),
-        np.einsum("ij,ij->j", half, half),
-        lambda rows: half.T @ half[:, rows],
-        found.nis,
-    )
+    M, _ = lapack.dpotri(found.chol_S, lower=1)
+    M = np.tril(M)
+    M += np.tril(M, -1).T
+    deletion = Deletion(M @ eta, np.diagonal(M), lambda rows: M[:, rows], found.nis)
     named, standing = deletion.search(eta**2 > FAR**2 * found.variance, largest)
     if named.any() and found.slopes is not None:
         acquitted = _acquitted(
