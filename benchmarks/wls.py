@@ -51,7 +51,7 @@ def run() -> list[Row]:
     """WLS of ieee118, the model built before, from a flat start."""
     import pandapower.estimation
 
-    network, net = library.load("ieee118"), pandapower_case("case118")
+    network, net = library.load("ieee118"), pandapower_case("ieee118")
     layout = layout_of(network)
     rng = np.random.default_rng(SEED)
     sigma = np.where(layout.quantity == VM, 0.004, 0.01)

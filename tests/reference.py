@@ -15,23 +15,18 @@ from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, FROM, IA, IM, TO, VA, VM, P, Q, SensorLayout
 
 GRIDS = ("ieee14", "ieee30", "ieee33", "ieee118")
-PANDAPOWER = {
-    "ieee14": "case14",
-    "ieee30": "case_ieee30",
-    "ieee33": "case33bw",
-    "ieee118": "case118",
-}
 
 
 @cache
 def pandapower_grid(name: str, **options: Any) -> Any:
-    """The copy of a grid that pandapower keeps, solved; its warnings are not ours to mend."""
+    """Pandapower's copy of a grid, mended and solved; its warnings are not ours to mend."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import pandapower
-        import pandapower.networks
 
-        net = getattr(pandapower.networks, PANDAPOWER[name])()
+        from pse_analysis.grid.tables.from_pandapower import net_of
+
+        net = net_of(name)
         pandapower.runpp(net, tolerance_mva=1e-9, numba=False, **options)
     return net
 
