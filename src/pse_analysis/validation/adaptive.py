@@ -21,9 +21,9 @@ missing sample.
 On a ramp the window would latch a channel to old values for ever, so a run of more than ``release``
 flagged samples that agree with each other becomes the window, and one of twice that length whether
 they agree or not. What is flagged is not learnt from, unless the next sample deviates to the same
-side: then the channel moved. Nor is anything flagged where more than half of the channels of a kind
-deviate to one side at once, by half their thresholds at least: errors are independent, and it is
-the grid that moved.
+side: then the channel moved. Nor is anything flagged where more than three in four channels of a
+kind deviate to one side at once, by half their thresholds at least: errors are independent, and it
+is the grid that moved.
 
 A step is a function of a state and one sample per channel; many at once are the same steps.
 """
@@ -51,6 +51,11 @@ AHEAD = np.array([[-0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 0.0, 1.0], [0.25, 0.25, 0.25
 """Weights of the last four values in the next one: on their line, as the last one, as their mean.
 
 √(1 + Σ w²) is √(1 + x'(X'X)⁻¹x) of the designs. (3, SPAN)
+"""
+COMMON = 0.75
+"""Share of a kind beyond which it is the grid that moved.
+
+One in ten samples being bad, half of five channels would err to one side once a day.
 """
 RATE = 1 / 20
 """Weight of the newest residual in how well each forecast served."""
@@ -322,9 +327,9 @@ def _printed(
 
 
 def _together(off: BoolArray, above: BoolArray, present: BoolArray, kind: IntArray) -> BoolArray:
-    """Channels off to the side to which most of their kind are, and three at least."""
+    """Channels off to the side to which three in four of their kind are, and three at least."""
     n = int(kind.max()) + 1
-    most = np.maximum(np.bincount(kind, present, n) / 2.0, 2.0)
+    most = np.maximum(COMMON * np.bincount(kind, present, n), 2.0)
     up = np.bincount(kind, off & above, n) > most
     down = np.bincount(kind, off & ~above, n) > most
     return np.asarray(off & np.where(above, up[kind], down[kind]))
