@@ -8,6 +8,7 @@ global state.
 from __future__ import annotations
 
 from pse_analysis.figures import machine
+from pse_analysis.figures.alignment import errors_at_instant, screened, warped
 from pse_analysis.figures.filters import curves
 from pse_analysis.figures.one_line import grid
 from pse_analysis.figures.paper import DOUBLE, SINGLE, Paper
@@ -28,10 +29,13 @@ __all__ = [
     "coverage_by_hour",
     "curves",
     "detection_table",
+    "errors_at_instant",
     "errors_by_bus",
     "flags",
     "grid",
     "machine",
     "score_table",
+    "screened",
     "voltage",
+    "warped",
 ]
