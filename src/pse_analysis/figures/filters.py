@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from pse_analysis.drawing import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
 from pse_analysis.errors import TableError
@@ -68,6 +68,9 @@ def curves(
         ax.set_ylabel(title)
         if log_x:
             ax.set_xscale("log")
+            if len(x) <= 6:
+                ax.set_xticks(x, [f"{value:g}" for value in x])
+                ax.xaxis.set_minor_locator(NullLocator())
         elif np.issubdtype(np.asarray(x).dtype, np.integer):
             ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         if log_y:
