@@ -64,6 +64,19 @@ def test_search_finds_the_cheapest_of_all_choices() -> None:
     assert set(np.flatnonzero(named)) == set(best) == {1, 6}
 
 
+@pytest.mark.parametrize("start", [(), (0, 2, 4, 9)], ids=str)
+def test_search_tells_the_standing_of_what_it_chose(start: tuple[int, ...]) -> None:
+    S, eta = correlated()
+    eta[[1, 6, 7]] += 25.0, -40.0, 30.0
+    d = deletion(S, eta)
+    named, found = d.search(chosen(12, *start), PRICE)
+    expected = deletion(S, eta).without(named)
+    assert set(np.flatnonzero(named)) == {1, 6, 7}
+    np.testing.assert_allclose(found.error, expected.error)
+    np.testing.assert_allclose(found.variance, expected.variance)
+    assert found.rest == pytest.approx(expected.rest)
+
+
 def test_what_was_left_out_without_need_is_taken_back() -> None:
     S, eta = correlated()
     eta[4] += 40.0

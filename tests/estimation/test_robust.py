@@ -58,6 +58,27 @@ def test_trace_matches_the_trace() -> None:
     assert inflated == pytest.approx(found.innovation @ found.innovation)
 
 
+def test_trace_is_raised_until_the_snapshot_passes() -> None:
+    """Forecasts that are loose to any degree, beside a factorisation for every factor tried."""
+    rng = np.random.default_rng(SEED)
+    raised = 0
+    for _ in range(40):
+        m = 30
+        half = 10.0 ** rng.uniform(-2.0, 3.0) * rng.standard_normal((m, 12))
+        noise = 10.0 ** rng.uniform(-3.0, 0.0, m)
+        S = half @ half.T + np.diag(noise)
+        eta = rng.standard_normal(m)
+        eta[3] = 10.0 ** rng.uniform(0.9, 2.0) * np.sqrt(S[3, 3])
+        nis = float(eta @ np.linalg.solve(S, eta))
+        first = phi = max(0.0, (eta @ eta - np.trace(S)) / noise.sum())
+        while eta @ np.linalg.solve(S + phi * np.diag(noise), eta) > gate(m)[0]:
+            phi = 4.0 * max(phi, 1.0)
+        found = Suspicion(eta, np.diagonal(S).copy(), noise, np.linalg.cholesky(S), nis)
+        np.testing.assert_allclose(robust.trace(found), phi)
+        raised += phi > first
+    assert raised > 10
+
+
 def test_wrong_channels_are_named_and_no_others() -> None:
     rng = np.random.default_rng(SEED)
     for wrong in ((3,), (0, 5), (1, 4, 9)):

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, sparse
-from scipy.linalg import blas
+from scipy import sparse
+from scipy.linalg import lapack
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -90,21 +90,11 @@ class Deletion:
 
     def without(self, left_out: BoolArray) -> Standing:
         """Standing of every measurement when some are left out. (m,)"""
+        return self._swept(left_out).standing(self._floor)
+
+    def _swept(self, left_out: BoolArray) -> _Swept:
         out = np.flatnonzero(left_out)
-        weighted, diagonal, rest = self._weighted, self._diagonal, self._total
-        error, variance = np.zeros_like(weighted), np.full_like(weighted, np.inf)
-        if len(out):
-            across = self._columns(out)
-            own = np.linalg.inv(across[out])
-            error[out] = own @ self._weighted[out]
-            variance[out] = np.diagonal(own)
-            rest = rest - float(self._weighted[out] @ error[out])
-            weighted = weighted - across @ error[out]
-            diagonal = diagonal - np.einsum("ij,ij->i", across @ own, across)
-        seen = ~left_out & (diagonal > self._floor)
-        error[seen] = weighted[seen] / diagonal[seen]
-        variance[seen] = 1.0 / diagonal[seen]
-        return Standing(error, variance, rest)
+        return _Swept(self._weighted, self._diagonal, self._total, out, self._columns(out))
 
     def search(
         self, start: BoolArray, price: float, most: float = LARGEST_SHARE
@@ -135,8 +125,9 @@ class Deletion:
         out = start.copy()
         if out.sum() > most * len(out):
             out[:] = False
+        swept = self._swept(out)
+        found, moves = swept.standing(self._floor), 0
         while True:
-            found = self.without(out)
             ratio = found.ratio
             worst = int(np.where(out, -np.inf, ratio).argmax())
             best = int(np.where(out, ratio, np.inf).argmin())
@@ -144,11 +135,92 @@ class Deletion:
             back = price - ratio[best] if out[best] else -np.inf
             # What rounding makes of a tie must not be moved to and fro.
             if max(gain, back) <= 1e-9 * price:
-                return out, found
+                # Anew, so that no rounding of the moves is left in what is told.
+                return out, self.without(out) if moves else found
             if gain >= back:
+                swept.leave_out(worst, self._columns(np.array([worst]))[:, 0])
                 out[worst] = True
             else:
+                swept.take_back(best)
                 out[best] = False
+            found, moves = swept.standing(self._floor), moves + 1
+
+
+class _Swept:
+    """A symmetric sweep of M, bordered by Mη and ηᵀMη, over the rows that are left out.
+
+    Between kept rows stands what is left of M, between left-out ones -(M_FF)⁻¹, and in the columns
+    of these what the kept ones make of them; so one more or one less is an update of rank one.
+
+    Parameters
+    ----------
+    weighted, diagonal : (m,) ndarray
+    rest : float
+    out : (k,) ndarray of int
+    across : (m, k) ndarray
+        Columns of M.
+    """
+
+    def __init__(
+        self,
+        weighted: FloatArray,
+        diagonal: FloatArray,
+        rest: float,
+        out: IntArray,
+        across: FloatArray,
+    ) -> None:
+        own = np.linalg.inv(across[out])
+        error = own @ weighted[out]
+        self._out, self._across = out, across
+        self._swept = across @ own
+        self._weighted = weighted - across @ error
+        self._diagonal = diagonal - np.einsum("ij,ij->i", self._swept, across)
+        self._rest = rest - float(weighted[out] @ error)
+        self._swept[out], self._weighted[out], self._diagonal[out] = -own, error, -np.diagonal(own)
+
+    def leave_out(self, row: int, column: FloatArray) -> None:
+        """Leave a kept row out, given its column of M."""
+        swept = column - self._across @ self._swept[row]
+        swept[self._out] = self._swept[row]
+        pivot = self._pivot(row, swept)
+        new = swept / pivot
+        new[row] = -1.0 / pivot
+        self._out = np.append(self._out, row)
+        self._across = np.column_stack([self._across, column])
+        self._swept = np.column_stack([self._swept, new])
+
+    def take_back(self, row: int) -> None:
+        """Keep a left-out row again."""
+        others = self._out != row
+        swept = self._swept[:, np.flatnonzero(~others)[0]]
+        self._out = self._out[others]
+        self._across, self._swept = self._across[:, others], self._swept[:, others]
+        self._pivot(row, swept)
+
+    def _pivot(self, row: int, swept: FloatArray) -> float:
+        pivot, weighted = float(swept[row]), float(self._weighted[row])
+        across = swept[self._out] / pivot
+        self._swept = self._swept - np.outer(swept, across)
+        self._weighted = self._weighted - (weighted / pivot) * swept
+        self._diagonal = self._diagonal - swept**2 / pivot
+        self._rest -= weighted**2 / pivot
+        sign = np.sign(pivot)
+        self._swept[row], self._weighted[row] = sign * across, weighted / abs(pivot)
+        self._diagonal[row] = -1.0 / pivot
+        return pivot
+
+    def standing(self, floor: FloatArray) -> Standing:
+        """Of every row; kept ones with less than the floor are seen by nothing else."""
+        known = self._diagonal > floor
+        known[self._out] = False
+        error, variance = np.zeros_like(floor), np.full_like(floor, np.inf)
+        error[known] = self._weighted[known] / self._diagonal[known]
+        variance[known] = 1.0 / self._diagonal[known]
+        error[self._out], variance[self._out] = (
+            self._weighted[self._out],
+            -self._diagonal[self._out],
+        )
+        return Standing(error, variance, self._rest)
 
 
 def of_snapshot(
@@ -173,16 +245,17 @@ def of_snapshot(
         Of the k rows. Its M = R⁻¹ - R⁻¹H G⁻¹HᵀR⁻¹ knows each voltage to `FORGOTTEN` around x, which
         keeps G regular whatever is left out, and says next to nothing.
     """
-    # Dense: for a few hundred rows the sparse products cost more in their making.
     root = 1.0 / np.sqrt(noise)
-    whitened = H.toarray() * root[:, None]
-    gain = blas.dsyrk(1.0, whitened.T, lower=1)
+    weights = np.repeat(root, np.diff(H.indptr))
+    whitened = sparse.csr_array((weights * H.data, H.indices, H.indptr), shape=H.shape)
+    gain = (whitened.T @ whitened).toarray()
     gain[np.diag_indices_from(gain)] += FORGOTTEN**-2
-    factor = linalg.cholesky(gain, lower=True, overwrite_a=True, check_finite=False)
-    own, scale = whitened[among], root[among]
-    half = linalg.solve_triangular(factor, own.T, lower=True, check_finite=False)
+    # Dense from here: sparse factors cost more in their making for a few hundred rows.
+    factor, _ = lapack.dpotrf(gain.T, lower=1, clean=0, overwrite_a=1)
+    own, scale = whitened[among].toarray(), root[among]
+    half, _ = lapack.dtrtrs(factor, own.T, lower=1)
     white = root * deviation
-    moved = linalg.cho_solve((factor, True), white @ whitened, check_finite=False)
+    moved, _ = lapack.dpotrs(factor, whitened.T @ white, lower=1)
 
     def columns(rows: IntArray) -> FloatArray:
         out = -(half.T @ half[:, rows])

@@ -14,8 +14,8 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, sparse, stats
-from scipy.linalg import lapack
+from scipy import sparse, stats
+from scipy.linalg import blas, lapack
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.deletion import Deletion, of_snapshot
@@ -102,15 +102,35 @@ def trace(found: Suspicion) -> FloatArray:
     phi = max(0.0, float(excess / found.noise.sum()))
     if (found.innovation**2 <= FAR**2 * found.variance).all():
         return np.full(m, phi)
-    L = np.tril(found.chol_S)
-    S = L @ L.T
     for _ in range(MOST_RAISES):
-        white = linalg.cholesky(S + np.diag(phi * found.noise), lower=True, check_finite=False)
-        left = linalg.solve_triangular(white, found.innovation, lower=True, check_finite=False)
-        if left @ left <= bound:
+        if _passes(found, phi, bound):
             break
         phi = RAISE * max(phi, 1.0)
     return np.full(m, phi)
+
+
+def _passes(found: Suspicion, phi: float, bound: float) -> bool:
+    """Whether ηᵀ(S + φR)⁻¹η is within a bound.
+
+    Conjugate gradients close in on it from below, and S ≥ R says by how much they may be short: a
+    few products instead of a factorisation.
+    """
+    scale = found.variance + phi * found.noise
+    least = (1.0 + phi) * found.noise
+    left, value = found.innovation, 0.0
+    step = left / scale
+    size = float(left @ step)
+    for _ in range(len(left)):
+        through = blas.dtrmv(found.chol_S, step, lower=1, trans=1)
+        image = blas.dtrmv(found.chol_S, through, lower=1) + phi * found.noise * step
+        length = size / float(step @ image)
+        value += length * size
+        left = left - length * image
+        if value > bound or value + float(left @ (left / least)) <= bound:
+            break
+        before, size = size, float(left @ (left / scale))
+        step = left / scale + (size / before) * step
+    return value <= bound
 
 
 def per_channel(found: Suspicion) -> FloatArray:
@@ -136,10 +156,15 @@ def per_channel(found: Suspicion) -> FloatArray:
     total, largest = gate(len(eta))
     if found.nis <= total and (eta**2 <= largest * found.variance).all():
         return np.zeros(len(eta))
-    M, _ = lapack.dpotri(found.chol_S, lower=1)
-    M = np.tril(M)
-    M += np.tril(M, -1).T
-    deletion = Deletion(M @ eta, np.diagonal(M), lambda rows: M[:, rows], found.nis)
+    # Of S⁻¹ only the diagonal and a few columns are asked for: L⁻¹ is enough.
+    inverse, _ = lapack.dtrtri(np.triu(found.chol_S.T).T, lower=1, overwrite_c=1)
+    weighted, _ = lapack.dpotrs(found.chol_S, eta, lower=1)
+    deletion = Deletion(
+        weighted,
+        np.einsum("ij,ij->j", inverse, inverse),
+        lambda rows: inverse.T @ inverse[:, rows],
+        found.nis,
+    )
     named, standing = deletion.search(eta**2 > FAR**2 * found.variance, largest)
     if named.any() and found.slopes is not None:
         acquitted = _acquitted(
