@@ -125,25 +125,23 @@ class Deletion:
         out = start.copy()
         if out.sum() > most * len(out):
             out[:] = False
-        swept = self._swept(out)
-        found, moves = swept.standing(self._floor), 0
+        swept, moves = self._swept(out), 0
         while True:
-            ratio = found.ratio
-            worst = int(np.where(out, -np.inf, ratio).argmax())
-            best = int(np.where(out, ratio, np.inf).argmin())
-            gain = -np.inf if out[worst] or out.sum() >= most * len(out) else ratio[worst] - price
-            back = price - ratio[best] if out[best] else -np.inf
+            ratio = swept.ratio(self._floor)
+            gain = np.where(out, price - ratio, ratio - price)
+            if out.sum() >= most * len(out):
+                gain[~out] = -np.inf
+            row = int(gain.argmax())
             # What rounding makes of a tie must not be moved to and fro.
-            if max(gain, back) <= 1e-9 * price:
+            if gain[row] <= 1e-9 * price:
                 # Anew, so that no rounding of the moves is left in what is told.
-                return out, self.without(out) if moves else found
-            if gain >= back:
-                swept.leave_out(worst, self._columns(np.array([worst]))[:, 0])
-                out[worst] = True
+                return out, self.without(out) if moves else swept.standing(self._floor)
+            if out[row]:
+                swept.take_back(row)
             else:
-                swept.take_back(best)
-                out[best] = False
-            found, moves = swept.standing(self._floor), moves + 1
+                swept.leave_out(row, self._columns(np.array([row]))[:, 0])
+            out[row] = not out[row]
+            moves += 1
 
 
 class _Swept:
@@ -209,6 +207,14 @@ class _Swept:
         self._diagonal[row] = -1.0 / pivot
         return pivot
 
+    def ratio(self, floor: FloatArray) -> FloatArray:
+        """`Standing.ratio` of every row, which is all that a search looks at."""
+        unseen = self._diagonal <= floor
+        unseen[self._out] = False
+        return np.where(unseen, 0.0, self._weighted**2) / np.where(
+            unseen, 1.0, np.abs(self._diagonal)
+        )
+
     def standing(self, floor: FloatArray) -> Standing:
         """Of every row; kept ones with less than the floor are seen by nothing else."""
         known = self._diagonal > floor
@@ -252,10 +258,11 @@ def of_snapshot(
     gain[np.diag_indices_from(gain)] += FORGOTTEN**-2
     # Dense from here: sparse factors cost more in their making for a few hundred rows.
     factor, _ = lapack.dpotrf(gain.T, lower=1, clean=0, overwrite_a=1)
-    own, scale = whitened[among].toarray(), root[among]
+    dense = whitened.toarray()
+    own, scale = dense[among], root[among]
     half, _ = lapack.dtrtrs(factor, own.T, lower=1)
     white = root * deviation
-    moved, _ = lapack.dpotrs(factor, whitened.T @ white, lower=1)
+    moved, _ = lapack.dpotrs(factor, white @ dense, lower=1)
 
     def columns(rows: IntArray) -> FloatArray:
         out = -(half.T @ half[:, rows])
