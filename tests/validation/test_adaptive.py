@@ -211,8 +211,25 @@ def test_a_channel_without_a_sample_keeps_its_past():
         state, _ = step(state, row, sigma, np.ones(1, dtype=bool), params)
     after, decision = step(state, np.array([9.9]), sigma, np.zeros(1, dtype=bool), params)
     assert not decision.flagged.any()
-    for before, now in zip(state, after, strict=True):
-        np.testing.assert_array_equal(before, now)
+    # Only the step itself is counted: nothing was learnt from it.
+    *before, newest = after.recent
+    assert np.isinf(newest).all()
+    np.testing.assert_array_equal(before, state.recent)
+    for past, now in zip(state._replace(recent=()), after._replace(recent=()), strict=True):
+        np.testing.assert_array_equal(past, now)
+
+
+def test_an_older_state_can_be_stepped_from_again():
+    params = AdaptiveParams()
+    z = voltage(n=60, m=5)
+    sigma, present = np.full(5, SIGMA), np.ones(5, dtype=bool)
+    states = [AdaptiveState.empty(5, params)]
+    for row in z:
+        states.append(step(states[-1], row, sigma, present, params)[0])
+    for k in (7, 30, 47):
+        again, _ = step(states[k], z[k], sigma, present, params)
+        for past, now in zip(states[k + 1], again, strict=True):
+            np.testing.assert_array_equal(past, now)
 
 
 @pytest.mark.parametrize("wrong", [{"window": 3}, {"decay": 0.0}, {"release": 4}])

@@ -126,7 +126,7 @@ class ScreenedState(NamedTuple):
     replaced : (m,) ndarray of bool
         Channels whose newest sample was replaced.
     value, sigma : (m,) ndarray
-        What stands for these as long as they are held.
+        What stands for these as long as they are held; of no meaning for the others.
     """
 
     inner: Any
@@ -162,11 +162,13 @@ def screened(
 
     def judged(
         state: ScreenedState, snapshot: Snapshot
-    ) -> tuple[ScreenedState, Snapshot, npt.NDArray[np.int32]]:
+    ) -> tuple[ScreenedState, Snapshot, npt.NDArray[np.int32] | None]:
         new = snapshot.available & snapshot.fresh
         own = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
         past, decision = adaptive.step(state.past, snapshot.z, own, new, params, turn, kind)
-        replaced = np.where(new, decision.flagged, state.replaced)
+        replaced = decision.flagged | (state.replaced & ~new)
+        if not (replaced.any() or decision.released.any()):
+            return state._replace(past=past, replaced=replaced), snapshot, None
         value = np.where(new, decision.value, state.value)
         sigma = np.where(new, decision.sigma, state.sigma)
         stands = snapshot.available & replaced
@@ -199,6 +201,8 @@ def screened(
             inner, info = estimator.init(seen)
         else:
             inner, info = estimator.step(state.inner, seen)
+        if reasons is None:
+            return state._replace(inner=inner), info
         widened = (seen.sigma / snapshot.sigma) ** 2 - 1.0
         inflation = np.where(
             reasons & int(Reason.INCREMENT), np.maximum(info.inflation, widened), info.inflation

@@ -25,7 +25,9 @@ side: then the channel moved. Nor is anything flagged where more than three in f
 kind deviate to one side at once, by half their thresholds at least: errors are independent, and it
 is the grid that moved.
 
-A step is a function of a state and one sample per channel; many at once are the same steps.
+A step is a function of a state and one sample per channel; many at once are the same steps. All
+channels take their quantiles again at the same step, one in eight: the large arrays are then copied
+once for all of them, and the other steps hand them on.
 """
 
 from __future__ import annotations
@@ -62,9 +64,10 @@ RATE = 1 / 20
 MEMORY = 288
 """Residuals that quantiles are taken of: a day of five-minute steps has calm hours and others."""
 RENEWAL = 8
-"""Residuals after which the quantiles are taken again; so few hardly move them.
+"""Steps after which the quantiles are taken again; so few residuals hardly move them.
 
-Before the first of these times a channel is not judged by ``scaled``.
+Before the first of these times at which it has so many residuals a channel is not judged by
+``scaled``.
 """
 
 
@@ -117,14 +120,14 @@ class AdaptiveState(NamedTuple):
         σ_e of the last samples.
     scores : (3, m) ndarray
         Mean |r| of every forecast of late.
-    recent : (m, RENEWAL) ndarray
-        |r| that were learnt since the last renewal.
-    residuals : (m, MEMORY / RENEWAL, RENEWAL) ndarray
+    recent : tuple of (m,) ndarray
+        |r| of the steps since the last renewal; inf where nothing was learnt.
+    residuals : (m, MEMORY) ndarray
         Those before, the newest written over the oldest; inf where there is none yet.
     learnt : (m,) ndarray of int
-        How many were.
+        How many were ever written.
     scale : (m,) ndarray
-        That of the residuals by body and tail, as of the last renewal.
+        That of the residuals by body and tail, as of the last renewal; NaN before the first.
     suspects : (release + 1, m) ndarray
         Raw values of the present run of flagged samples.
     deviation : (m,) ndarray
@@ -136,7 +139,7 @@ class AdaptiveState(NamedTuple):
     values: FloatArray
     sigmas: FloatArray
     scores: FloatArray
-    recent: FloatArray
+    recent: tuple[FloatArray, ...]
     residuals: FloatArray
     learnt: IntArray
     scale: FloatArray
@@ -152,10 +155,10 @@ class AdaptiveState(NamedTuple):
             np.full((max(params.window - 1, SPAN), m), np.nan),
             np.full((SPAN, m), np.nan),
             np.zeros((len(AHEAD), m)),
-            np.full((m, RENEWAL), np.inf),
-            np.full((m, MEMORY // RENEWAL, RENEWAL), np.inf),
+            (),
+            np.full((m, MEMORY), np.inf),
             np.zeros(m, dtype=np.int64),
-            np.zeros(m),
+            np.full(m, np.nan),
             np.full((params.release + 1, m), np.nan),
             np.zeros(m),
             np.zeros(m, dtype=np.int64),
@@ -214,64 +217,71 @@ def step(
     state : AdaptiveState
     decision : Decision
     """
-    channel = np.arange(len(z))
     z_near = windows.near(z, state.values[-1], turn)
-    deviations = z_near - (AHEAD[:, :, None] * state.values[-SPAN:]).sum(axis=1)
+    deviations = z_near - _forecasts(state.values)
     served = state.scores.argmin(axis=0)
-    deviation = deviations[served, channel]
+    deviation = deviations[served, np.arange(len(z))]
     residual = np.abs(deviation)
     # Samples of one channel may differ in σ: σ_e² (1 + x'(X'X)⁻¹x) is then this sum.
-    noise = np.sqrt(sigma**2 + ((AHEAD[served].T * state.sigmas) ** 2).sum(axis=0))
-    scaled = params.factor * np.maximum(noise, state.scale)
+    spread = (AHEAD.take(served, axis=0).T * state.sigmas) ** 2
+    noise = np.sqrt(sigma**2 + np.add.reduce(spread))
     if params.threshold == "scaled":
-        # A channel is not judged by a past that it does not have yet.
-        judged = np.isfinite(residual) & (state.learnt >= RENEWAL)
-        statistic, threshold = residual, np.where(judged, scaled, np.nan)
+        # NaN, which flags nothing, as long as a channel has no scale yet.
+        statistic, threshold = residual, params.factor * np.maximum(noise, state.scale)
     else:
         statistic, threshold = _printed(state.values, z_near, sigma, params)
     suspicious = present & (statistic > threshold)
-    if kind is not None and params.threshold == "scaled" and suspicious.any():
+    found = bool(suspicious.any())
+    if found and kind is not None and params.threshold == "scaled":
         suspicious &= ~_together(
             present & (residual > 0.5 * threshold), deviation > 0, present, kind
         )
-
-    accepted, value, wide = z_near, z, sigma
-    suspects, run = state.suspects, np.where(present, 0, state.run)
-    flagged = released = suspicious
-    if suspicious.any():
-        suspects = windows.pushed(suspects, z_near, suspicious)
-        run = np.where(suspicious, state.run + 1, run)
-        released = suspicious & (run > params.release)
-        if released.any():
-            released &= windows.agree(suspects, scaled) | (run > 2 * params.release)
-        flagged = suspicious & ~released
-        replacement, least = _replacement(state.values, z_near, sigma, params)
-        accepted, value = np.where(flagged, replacement, z_near), np.where(flagged, replacement, z)
-        wide = np.where(flagged, least, sigma)
+        found = bool(suspicious.any())
 
     known = present & np.isfinite(residual)
-    values = windows.pushed(state.values, accepted, present)
-    scores = state.scores + np.where(known, RATE * (np.abs(deviations) - state.scores), 0.0)
+    scores = np.abs(deviations)
+    scores -= state.scores
+    scores *= RATE
+    scores = np.where(known, scores + state.scores, state.scores)
+    following = state._replace(
+        values=windows.pushed(state.values, z_near, present),
+        sigmas=windows.pushed(state.sigmas, sigma, present),
+        scores=scores,
+        run=np.where(present, 0, state.run),
+    )
+    if not found:
+        decision = Decision(suspicious, suspicious, z, sigma, statistic, threshold)
+        return _learnt(following, np.where(known, residual, np.inf), params.factor), decision
+
+    suspects = windows.pushed(state.suspects, z_near, suspicious)
+    run = np.where(suspicious, state.run + 1, following.run)
+    released = suspicious & (run > params.release)
+    if released.any():
+        bound = params.factor * np.fmax(noise, state.scale)
+        released &= windows.agree(suspects, bound) | (run > 2 * params.release)
+    flagged = suspicious & ~released
+    replacement, wide = _replacement(state.values, z_near, sigma, params)
+    values = following.values
+    values[-1, flagged] = replacement[flagged]
     if released.any():
         values[:, released] = suspects[-len(values) :, released]
         scores[:, released] = _tried(suspects[:, released])
-    recent, residuals, learnt, scale = _learn(
-        state, z_near, deviation, known, suspicious, run, params.factor
+    size, learns = _moved(state, z_near, deviation, suspicious, run)
+    following = following._replace(
+        suspects=suspects,
+        deviation=np.where(suspicious, deviation, state.deviation),
+        run=np.where(released, 0, run),
+        releases=state.releases + released,
     )
-    following = AdaptiveState(
-        values,
-        windows.pushed(state.sigmas, sigma, present),
-        scores,
-        recent,
-        residuals,
-        learnt,
-        scale,
-        suspects,
-        np.where(suspicious, deviation, state.deviation),
-        np.where(released, 0, run),
-        state.releases + released,
+    decision = Decision(
+        flagged,
+        released,
+        np.where(flagged, replacement, z),
+        np.where(flagged, wide, sigma),
+        statistic,
+        threshold,
     )
-    return following, Decision(flagged, released, value, wide, statistic, threshold)
+    return _learnt(following, np.where(known & learns, size, np.inf), params.factor), decision
 
 
 def screen(
@@ -347,46 +357,51 @@ def _replacement(
     return replacement, wide
 
 
-def _learn(
+def _moved(
     state: AdaptiveState,
     z: FloatArray,
     deviation: FloatArray,
-    known: BoolArray,
     suspicious: BoolArray,
     run: IntArray,
-    factor: float,
-) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Recent and older residuals, their number and scale after a sample.
+) -> tuple[FloatArray, BoolArray]:
+    """|r| that a sample teaches, and whether it does, where some are suspicious.
 
     If only accepted residuals were learnt, a channel that begins to move would never be told so. A
     flagged one counts if the next deviates to the same side, by the smaller of the two, and from
     then on by the steps within the run. Independent errors do that once in a while (at a share q in
     q²/2 of all samples), which leaves the quantiles where they are.
     """
-    residual, learns = np.abs(deviation), known & ~suspicious
-    if suspicious.any():
-        moved = suspicious & (run >= 2) & (deviation * state.deviation > 0)
-        first = np.minimum(residual, np.abs(state.deviation))
-        size = np.where(run == 2, first, np.abs(z - state.suspects[-1]))
-        residual, learns = np.where(moved, size, residual), learns | moved
-    at = np.flatnonzero(learns)
-    recent, residuals, scale = state.recent.copy(), state.residuals, state.scale
-    recent[at, state.learnt[at] % RENEWAL] = residual[at]
-    learnt = state.learnt + learns
-    full = at[learnt[at] % RENEWAL == 0]
-    if len(full):
-        residuals, scale = residuals.copy(), scale.copy()
-        block = (learnt[full] // RENEWAL - 1) % residuals.shape[1]
-        residuals[full, block] = recent[full]
-        count = np.minimum(learnt[full], MEMORY)
-        scale[full] = tails.scale(residuals[full].reshape(len(full), MEMORY), count, factor)
-    return recent, residuals, learnt, scale
+    residual = np.abs(deviation)
+    moved = suspicious & (run >= 2) & (deviation * state.deviation > 0)
+    first = np.minimum(residual, np.abs(state.deviation))
+    size = np.where(run == 2, first, np.abs(z - state.suspects[-1]))
+    return np.where(moved, size, residual), moved | ~suspicious
+
+
+def _learnt(state: AdaptiveState, newest: FloatArray, factor: float) -> AdaptiveState:
+    """The state with the newest |r|, and with new scales once there are enough."""
+    recent = (*state.recent, newest)
+    if len(recent) < RENEWAL:
+        return state._replace(recent=recent)
+    rows = np.array(recent).T
+    at, step = np.nonzero(np.isfinite(rows))
+    number = state.learnt[:, None] + np.cumsum(np.isfinite(rows), axis=1)
+    residuals, scale = state.residuals.copy(), state.scale.copy()
+    residuals[at, (number[at, step] - 1) % MEMORY] = rows[at, step]
+    learnt = number[:, -1]
+    renewed = np.flatnonzero((learnt > state.learnt) & (learnt >= RENEWAL))
+    if len(renewed):
+        count = np.minimum(learnt[renewed], MEMORY)
+        scale[renewed] = tails.scale(residuals[renewed], count, factor)
+    return state._replace(recent=(), residuals=residuals, learnt=learnt, scale=scale)
+
+
+def _forecasts(values: FloatArray) -> FloatArray:
+    """What every forecast says, added in one order however many channels there are. (3, m)"""
+    return np.asarray(np.add.reduce(AHEAD[:, :, None] * values[-SPAN:], axis=1))
 
 
 def _tried(suspects: FloatArray) -> FloatArray:
     """Mean |r| of every forecast along a run of values."""
-    ahead = [
-        np.abs(suspects[k] - (AHEAD[:, :, None] * suspects[k - SPAN : k]).sum(axis=1))
-        for k in range(SPAN, len(suspects))
-    ]
+    ahead = [np.abs(suspects[k] - _forecasts(suspects[:k])) for k in range(SPAN, len(suspects))]
     return np.asarray(np.mean(ahead, axis=0))

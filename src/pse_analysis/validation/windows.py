@@ -11,12 +11,13 @@ BoolArray = npt.NDArray[np.bool_]
 
 def near(z: FloatArray, last: FloatArray, turn: FloatArray | float) -> FloatArray:
     """Samples, with angles turned by whole turns to the last value of their channel."""
-    angle = np.isfinite(turn) & np.isfinite(last)
-    if not angle.any():
+    beyond = z - last
+    far = 2.0 * np.abs(beyond) > turn
+    if not far.any():
         return z
-    full = np.broadcast_to(turn, z.shape)[angle]
+    full = np.broadcast_to(turn, z.shape)[far]
     near = z.copy()
-    near[angle] -= np.rint((z[angle] - last[angle]) / full) * full
+    near[far] -= np.rint(beyond[far] / full) * full
     return near
 
 
@@ -27,12 +28,7 @@ def weighted(weight: npt.NDArray[np.floating], rows: FloatArray) -> FloatArray:
 
 def pushed(past: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
     """The past with a new row at its end, in some columns."""
-    if where.all():
-        return np.concatenate([past[1:], new[None]])
-    out = past.copy()
-    out[:-1, where] = past[1:, where]
-    out[-1, where] = new[where]
-    return out
+    return np.where(where, np.concatenate([past[1:], new[None]]), past)
 
 
 def agree(suspects: FloatArray, bound: FloatArray) -> BoolArray:
