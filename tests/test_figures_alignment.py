@@ -43,17 +43,20 @@ def test_errors_stand_at_their_buses_in_thousandths() -> None:
 def test_a_screened_channel_shows_its_flags_inside_the_window() -> None:
     z = 1.0 + 0.005 * np.random.default_rng(SEED).standard_normal((80, 1))
     z[50] += 0.1
+    calm = np.ones((80, 1))
+    columns = {"calm": calm, "bad": z}
     drawn = figures.screened(
         np.arange(80),
-        {"bad": (z, adaptive.screen(z, np.array([0.005])))},
+        {title: (v, adaptive.screen(v, np.array([0.005]))) for title, v in columns.items()},
         label="|V|",
         unit="p.u.",
         window=(40, 60),
         bad=(50, 50),
     )
-    above, below = drawn.axes
+    _, above, _, below = drawn.axes
     flags = next(line for line in below.lines if line.get_label() == "flagged")
     assert 50 in flags.get_xdata()
+    assert below.get_ylim()[1] > flags.get_ydata().max()  # nothing is cut off
     assert min(above.lines[0].get_xdata()) == 40
     assert max(above.lines[0].get_xdata()) == 60
-    assert above.get_ylabel() == "|V| [p.u.]"
+    assert drawn.axes[0].get_ylabel() == "|V| [p.u.]"

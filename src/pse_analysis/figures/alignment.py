@@ -10,13 +10,16 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION
-from pse_analysis.figures.paper import DOUBLE, MEASURED, SYMBOL, Paper, legend, paper, styled
+from pse_analysis.figures.paper import DOUBLE, MEASURED, Paper, legend, paper, styled
 
 Floats = npt.NDArray[np.float64]
 
 APART = 4.0
 """Distance between two curves of z-scores, in σ."""
-FACTOR = {"vm_pu": (1e3, "10⁻³ p.u."), "va_degree": (1e3 * np.pi / 180.0, "10⁻³ rad")}
+SHOWN = {
+    "vm_pu": (1e3, "error of |V| [10⁻³ p.u.]"),
+    "va_degree": (1e3 * np.pi / 180.0, "error of the angle [10⁻³ rad]"),
+}
 
 
 class Match(Protocol):
@@ -102,7 +105,7 @@ def errors_at_instant(
     """
     figure = paper(width, 2.4)
     axes = figure.subplots(1, 2)
-    for ax, (quantity, (factor, unit)) in zip(axes, FACTOR.items(), strict=True):
+    for ax, (quantity, (factor, label)) in zip(axes, SHOWN.items(), strict=True):
         for (method, name), colour in zip(names.items(), (BLUE, ORANGE, GREEN), strict=False):
             own = paired[(paired["method"] == method) & (paired["quantity"] == quantity)]
             bus = own["element"].str.removeprefix("bus/").astype(int)
@@ -110,7 +113,7 @@ def errors_at_instant(
             ax.plot(bus, size, ".", color=colour, label=name)
         ax.set_ylim(bottom=0)
         ax.set_xlabel("bus")
-        ax.set_ylabel(f"error of {SYMBOL[quantity]} [{unit}]")
+        ax.set_ylabel(label)
     legend(figure, *axes)
     return figure
 
@@ -152,9 +155,9 @@ def screened(
         hit = decision.flagged[inside, 0]
         column[1].plot(step[inside][hit], size[hit], "x", color=VERMILION, label="flagged")
         column[1].set_xlabel("step")
-        column[1].set_ylim(bottom=0)
         for ax in column:
             ax.axvspan(*bad, color="#EEEEEE", zorder=0)
+    axes[1, 0].set_ylim(bottom=0)
     axes[0, 0].set_ylabel(f"{label} [{unit}]")
     axes[1, 0].set_ylabel(f"[{unit}]")
     legend(figure, axes[1, -1])
