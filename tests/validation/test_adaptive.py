@@ -180,16 +180,16 @@ def test_an_angle_that_passes_its_turn_is_no_jump():
 
 
 def test_what_most_channels_of_a_kind_do_at_once_is_no_error():
-    z = voltage(m=8)
-    z[300:, :3] += 0.06
-    z[300, 3] -= 0.06
-    z[300, 5:7] += 0.06
-    kind = np.array([0, 0, 0, 0, 0, 1, 1, 1])
+    z = voltage(m=9)
+    z[300:, :5] += 0.06
+    z[300, 5] -= 0.06
+    z[300, 6:8] += 0.06
+    kind = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1])
     apart, together = screen(z, SIGMA), screen(z, SIGMA, kind=kind)
-    np.testing.assert_array_equal(apart.flagged[300], [1, 1, 1, 1, 0, 1, 1, 0])
-    # Three of five to one side moved; the fourth, and two of three, may be errors.
-    np.testing.assert_array_equal(together.flagged[300], [0, 0, 0, 1, 0, 1, 1, 0])
-    assert not together.flagged[301:310, :3].any()
+    np.testing.assert_array_equal(apart.flagged[300], [1, 1, 1, 1, 1, 1, 1, 1, 0])
+    # Five of six to one side moved; the sixth, and two of three, may be errors.
+    np.testing.assert_array_equal(together.flagged[300], [0, 0, 0, 0, 0, 1, 1, 1, 0])
+    assert not together.flagged[301:310, :5].any()
     np.testing.assert_array_equal(apart.flagged[:300], together.flagged[:300])
 
 
