@@ -31,7 +31,7 @@ def seconds(value: float) -> str:
     """A time in a unit that suits its size."""
     if math.isnan(value):
         return "–"
-    unit, factor = (("s", 1.0), ("ms", 1e3))[value < 1.0]
+    unit, factor = ("ms", 1e3) if value < 1.0 else ("s", 1.0)
     return f"{value * factor:.3g} {unit}"
 
 
