@@ -12,8 +12,7 @@ import simulated_case
 from simulated_case import PARAMS, STUDY, curves, feeder
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.grid import library, power_flow
-from pse_analysis.grid import BusKind
+from pse_analysis.grid import BusKind, library, power_flow
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 from pse_analysis.simulation import scenario
 from pse_analysis.simulation.settings import (
