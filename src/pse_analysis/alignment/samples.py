@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.alignment.stamps import SamplingTimes
+from pse_analysis.alignment.stamps import SamplingTimes, microseconds
 from pse_analysis.measurement import IA, VA, SensorLayout, standard_deviation, wrap
 from pse_analysis.vocabulary import usable
 
@@ -196,12 +196,6 @@ class Samples:
             moved = change**2 - 2.0 * MEDIAN_VARIANCE * noise
             out[g] = max(float(moved.sum()), 0.0) / float(span.sum())
         return out
-
-
-def microseconds(times: pd.Series) -> IntArray:
-    """Times as whole numbers. [µs since 1970 UTC]"""
-    naive = times.dt.tz_convert("UTC").dt.tz_localize(None)
-    return np.asarray(naive.to_numpy().astype("datetime64[us]").astype(np.int64))
 
 
 def first_use(at: IntArray, row: IntArray) -> BoolArray:

@@ -86,7 +86,7 @@ def sampling_times(
     """
     params = params or TimeParams()
     n = len(validated)
-    stamp, arrival = (_microseconds(validated[c]) for c in ("time_utc", "arrival_utc"))
+    stamp, arrival = (microseconds(validated[c]) for c in ("time_utc", "arrival_utc"))
     out = SamplingTimes(stamp.copy(), np.ones(n), np.zeros(n, dtype=np.int8), {})
     if method == "none" or not n:
         return out
@@ -159,9 +159,9 @@ def rms_errors(
     frame["device"] = frame["channel"].str.rsplit(":", n=1).str[0]
     frame = frame[frame["device"].isin(times.partner) & (frame["arrival_utc"] >= since)]
     frame = frame.merge(sample_truth[[*key, "time_utc"]], on=key)
-    true = _microseconds(frame["time_utc"])
+    true = microseconds(frame["time_utc"])
     frame["error"] = (frame["time"] - true) / MICROSECOND
-    frame["late"] = (_microseconds(frame["arrival_utc"]) - true) / MICROSECOND
+    frame["late"] = (microseconds(frame["arrival_utc"]) - true) / MICROSECOND
     grouped = frame.groupby(["device", "how"], sort=True)
     return pd.DataFrame(
         {
@@ -176,7 +176,8 @@ def _rms(values: pd.Series) -> float:
     return float(np.sqrt(np.mean(values.to_numpy(dtype=float) ** 2)))
 
 
-def _microseconds(times: pd.Series) -> IntArray:
+def microseconds(times: pd.Series) -> IntArray:
+    """Times as whole numbers. [µs since 1970 UTC]"""
     return np.asarray(
         times.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy().astype("datetime64[us]")
     ).astype(np.int64)
