@@ -9,7 +9,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from benchmarks.timing import Row, alternate
-from pse_analysis.estimation import intervals, matching, screening
+from pse_analysis.estimation import intervals, matching, refusal
 from pse_analysis.estimation.estimator import Estimator, Snapshot
 from pse_analysis.estimation.holt import local_trend
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
@@ -57,11 +57,11 @@ def run() -> list[Row]:
     note = "ours also transforms the measurements and makes Q"
     rows.append(Row("Kalman step, ieee33, as of the instant", *times, "filterpy", note))
     for name, plain, options in (
-        ("screened by innovation", instant, {"instant": True, "refuse": screening.refuse()}),
+        ("screened by innovation", instant, {"instant": True, "refuse": refusal.refuse()}),
         (
             "over intervals, screened by innovation",
             interval,
-            {"reach_s": LAGS * STEP_S, "refuse": screening.refuse()},
+            {"reach_s": LAGS * STEP_S, "refuse": refusal.refuse()},
         ),
         ("local trend", instant, {"instant": True, "process": local_trend()}),
     ):

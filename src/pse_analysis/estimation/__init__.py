@@ -15,6 +15,7 @@ from pse_analysis.estimation import (
     machine,
     matching,
     process,
+    refusal,
     screening,
 )
 from pse_analysis.estimation.composition import Composition
@@ -162,7 +163,7 @@ def _build_plain(
         step_s=study.step_s,
         reach_s=_reach(history, layout, study.step_s),
         instant=method.reading == "instant",
-        refuse=screening.refuse() if method.screening == "innovation" else None,
+        refuse=refusal.refuse() if method.screening == "innovation" else None,
         process=composition.process_of(method.compose),
     )
 

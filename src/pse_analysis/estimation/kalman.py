@@ -26,7 +26,7 @@ from pse_analysis.estimation.readings import (
     innovation_of,
     responses,
 )
-from pse_analysis.estimation.screening import Refuse
+from pse_analysis.estimation.refusal import Refuse
 from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
