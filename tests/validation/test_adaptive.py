@@ -212,11 +212,23 @@ def test_a_channel_without_a_sample_keeps_its_past():
     after, decision = step(state, np.array([9.9]), sigma, np.zeros(1, dtype=bool), params)
     assert not decision.flagged.any()
     # Only the step itself is counted: nothing was learnt from it.
-    *before, newest = after.recent
+    *before, newest = after.residuals.recent
     assert np.isinf(newest).all()
-    np.testing.assert_array_equal(before, state.recent)
-    for past, now in zip(state._replace(recent=()), after._replace(recent=()), strict=True):
-        np.testing.assert_array_equal(past, now)
+    np.testing.assert_array_equal(before, state.residuals.recent)
+    same(without_recent(state), without_recent(after))
+
+
+def without_recent(state: AdaptiveState) -> AdaptiveState:
+    return state._replace(residuals=state.residuals._replace(recent=()))
+
+
+def same(first: tuple, second: tuple) -> None:
+    """All arrays of two states are equal, however deep they stand."""
+    for one, other in zip(first, second, strict=True):
+        if isinstance(one, tuple):
+            same(one, other)
+        else:
+            np.testing.assert_array_equal(one, other)
 
 
 def test_an_older_state_can_be_stepped_from_again():
@@ -227,9 +239,7 @@ def test_an_older_state_can_be_stepped_from_again():
     for row in z:
         states.append(step(states[-1], row, sigma, present, params)[0])
     for k in (7, 30, 47):
-        again, _ = step(states[k], z[k], sigma, present, params)
-        for past, now in zip(states[k + 1], again, strict=True):
-            np.testing.assert_array_equal(past, now)
+        same(states[k + 1], step(states[k], z[k], sigma, present, params)[0])
 
 
 @pytest.mark.parametrize("wrong", [{"window": 3}, {"decay": 0.0}, {"release": 4}])
@@ -250,6 +260,13 @@ def test_spread_of_each_forecast_is_that_of_its_design():
         np.testing.assert_allclose(weights[-len(design) :], own, atol=1e-12)
         spread = 1 + ahead @ np.linalg.solve(design.T @ design, ahead)
         np.testing.assert_allclose(1 + weights @ weights, spread)
+
+
+def test_forecasts_are_those_of_their_weights():
+    past = np.random.default_rng(SEED).normal(size=(6, 50))
+    z = np.arange(50.0)
+    found = adaptive._deviations(past, z)
+    np.testing.assert_allclose(z - found, adaptive.AHEAD @ past[-4:], rtol=1e-12, atol=1e-12)
 
 
 def test_threshold_is_the_formula_of_the_forecast_that_serves_best():

@@ -70,6 +70,11 @@ class Snapshot:
     inputs: FloatArray | None = None
     topology: str = ""
 
+    @property
+    def sigma_own(self) -> FloatArray:
+        """σ of the samples themselves, without what age added. (m,) [p.u., rad]"""
+        return np.asarray(np.sqrt(np.maximum(self.sigma**2 - self.sigma_age**2, 0.0)))
+
 
 @dataclass(frozen=True, eq=False)
 class Info:

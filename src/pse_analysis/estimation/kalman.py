@@ -205,8 +205,7 @@ class KalmanFilter:
         near = intervals.covered(
             snapshot.age_s, self.layout.window_s, self.step_s, self.lagged.lags
         )
-        own = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
-        return snapshot.available & snapshot.fresh & near, own
+        return snapshot.available & snapshot.fresh & near, snapshot.sigma_own
 
     def _read(
         self,

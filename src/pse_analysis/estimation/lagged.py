@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.linalg import blas
 
 from pse_analysis.estimation.holt import Process
 from pse_analysis.measurement.rectangular import Memo
@@ -275,19 +274,3 @@ def turned_rows(functionals: FloatArray, turn: ComplexArray, group: IntArray) ->
     other *= turn.imag[:, None]
     out += other
     return out
-
-
-def less(P: FloatArray, X: FloatArray) -> FloatArray:
-    """P - X Xᵀ in the place of P, exactly symmetric."""
-    # In the order that BLAS reads, a symmetric matrix is its own transpose.
-    out = blas.dsyrk(-1.0, X, beta=1.0, c=P.T, lower=1, overwrite_c=1)
-    for begin in range(0, len(out), _STRIP):
-        strip = slice(begin, begin + _STRIP)
-        own = out[strip, strip]
-        np.copyto(own, own.T, where=_UPPER[: len(own), : len(own)])
-        out[:begin, strip] = out[strip, :begin].T
-    return np.asarray(out.T)
-
-
-_STRIP = 64
-_UPPER = np.asfortranarray(np.triu(np.ones((_STRIP, _STRIP), dtype=bool), 1))

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
-from pse_analysis.estimation.lagged import Expected, less, turned, turned_rows
+from pse_analysis.estimation.lagged import Expected, turned, turned_rows
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -91,7 +91,8 @@ def conditioned(P: FloatArray, readings: Readings, innovation: Innovation) -> Fl
     group, expected = readings.group, readings.expected
     cross = turned_rows(expected.cross, innovation.turn, group)
     X = blas.dtrsm(1.0, innovation.chol_S, cross.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-    return less(P, X)
+    P -= X @ X.T  # a product with its own transpose is exactly symmetric
+    return P
 
 
 def responses(

@@ -72,11 +72,13 @@ def screened(
         state: ScreenedState, snapshot: Snapshot
     ) -> tuple[ScreenedState, Snapshot, npt.NDArray[np.int32] | None]:
         new = snapshot.available & snapshot.fresh
-        own = np.sqrt(np.maximum(snapshot.sigma**2 - snapshot.sigma_age**2, 0.0))
-        past, decision = adaptive.step(state.past, snapshot.z, own, new, params, turn, kind)
-        replaced = decision.flagged | (state.replaced & ~new)
-        if not (replaced.any() or decision.released.any()):
-            return state._replace(past=past, replaced=replaced), snapshot, None
+        past, decision = adaptive.step(
+            state.past, snapshot.z, snapshot.sigma_own, new, params, turn, kind
+        )
+        held = state.replaced & ~new
+        if not (held.any() or decision.flagged.any() or decision.released.any()):
+            return state._replace(past=past, replaced=held), snapshot, None
+        replaced = decision.flagged | held
         value = np.where(new, decision.value, state.value)
         sigma = np.where(new, decision.sigma, state.sigma)
         stands = snapshot.available & replaced

@@ -25,9 +25,7 @@ side: then the channel moved. Nor is anything flagged where more than three in f
 kind deviate to one side at once, by half their thresholds at least: errors are independent, and it
 is the grid that moved.
 
-A step is a function of a state and one sample per channel; many at once are the same steps. All
-channels take their quantiles again at the same step, one in eight: the large arrays are then copied
-once for all of them, and the other steps hand them on.
+A step is a function of a state and one sample per channel; many at once are the same steps.
 """
 
 from __future__ import annotations
@@ -54,6 +52,8 @@ AHEAD = np.array([[-0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 0.0, 1.0], [0.25, 0.25, 0.25
 
 √(1 + Σ w²) is √(1 + x'(X'X)⁻¹x) of the designs. (3, SPAN)
 """
+GROWTH = np.sqrt(1.0 + (AHEAD**2).sum(axis=1))
+"""σ of a forecast's residual over that of a sample. (3,)"""
 COMMON = 0.75
 """Share of a kind beyond which it is the grid that moved.
 
@@ -61,14 +61,6 @@ One in ten samples being bad, half of five channels would err to one side once a
 """
 RATE = 1 / 20
 """Weight of the newest residual in how well each forecast served."""
-MEMORY = 288
-"""Residuals that quantiles are taken of: a day of five-minute steps has calm hours and others."""
-RENEWAL = 8
-"""Steps after which the quantiles are taken again; so few residuals hardly move them.
-
-Before the first of these times at which it has so many residuals a channel is not judged by
-``scaled``.
-"""
 
 
 @dataclass(frozen=True)
@@ -116,18 +108,10 @@ class AdaptiveState(NamedTuple):
     ----------
     values : (L, m) ndarray
         Accepted and replaced values.
-    sigmas : (SPAN, m) ndarray
-        σ_e of the last samples.
     scores : (3, m) ndarray
         Mean |r| of every forecast of late.
-    recent : tuple of (m,) ndarray
-        |r| of the steps since the last renewal; inf where nothing was learnt.
-    residuals : (m, MEMORY) ndarray
-        Those before, the newest written over the oldest; inf where there is none yet.
-    learnt : (m,) ndarray of int
-        How many were ever written.
-    scale : (m,) ndarray
-        That of the residuals by body and tail, as of the last renewal; NaN before the first.
+    residuals : Residuals
+        |r| that were learnt, and the scales that they tell.
     suspects : (release + 1, m) ndarray
         Raw values of the present run of flagged samples.
     deviation : (m,) ndarray
@@ -137,12 +121,8 @@ class AdaptiveState(NamedTuple):
     """
 
     values: FloatArray
-    sigmas: FloatArray
     scores: FloatArray
-    recent: tuple[FloatArray, ...]
-    residuals: FloatArray
-    learnt: IntArray
-    scale: FloatArray
+    residuals: tails.Residuals
     suspects: FloatArray
     deviation: FloatArray
     run: IntArray
@@ -153,12 +133,8 @@ class AdaptiveState(NamedTuple):
         """State of m channels of which nothing is known."""
         return cls(
             np.full((max(params.window - 1, SPAN), m), np.nan),
-            np.full((SPAN, m), np.nan),
             np.zeros((len(AHEAD), m)),
-            (),
-            np.full((m, MEMORY), np.inf),
-            np.zeros(m, dtype=np.int64),
-            np.full(m, np.nan),
+            tails.Residuals.empty(m),
             np.full((params.release + 1, m), np.nan),
             np.zeros(m),
             np.zeros(m, dtype=np.int64),
@@ -218,16 +194,14 @@ def step(
     decision : Decision
     """
     z_near = windows.near(z, state.values[-1], turn)
-    deviations = z_near - _forecasts(state.values)
+    deviations = _deviations(state.values, z_near)
     served = state.scores.argmin(axis=0)
     deviation = deviations[served, np.arange(len(z))]
     residual = np.abs(deviation)
-    # Samples of one channel may differ in σ: σ_e² (1 + x'(X'X)⁻¹x) is then this sum.
-    spread = (AHEAD.take(served, axis=0).T * state.sigmas) ** 2
-    noise = np.sqrt(sigma**2 + np.add.reduce(spread))
+    noise = GROWTH.take(served) * sigma
     if params.threshold == "scaled":
         # NaN, which flags nothing, as long as a channel has no scale yet.
-        statistic, threshold = residual, params.factor * np.maximum(noise, state.scale)
+        statistic, threshold = residual, params.factor * np.maximum(noise, state.residuals.scale)
     else:
         statistic, threshold = _printed(state.values, z_near, sigma, params)
     suspicious = present & (statistic > threshold)
@@ -239,39 +213,41 @@ def step(
         found = bool(suspicious.any())
 
     known = present & np.isfinite(residual)
-    scores = np.abs(deviations)
+    scores = np.abs(deviations, out=deviations)
     scores -= state.scores
     scores *= RATE
-    scores = np.where(known, scores + state.scores, state.scores)
-    following = state._replace(
-        values=windows.pushed(state.values, z_near, present),
-        sigmas=windows.pushed(state.sigmas, sigma, present),
-        scores=scores,
-        run=np.where(present, 0, state.run),
-    )
+    scores += state.scores
+    if not known.all():
+        scores = np.where(known, scores, state.scores)
+    newest = np.where(known, residual, np.inf)
+    values = windows.pushed(state.values, z_near, present)
     if not found:
         decision = Decision(suspicious, suspicious, z, sigma, statistic, threshold)
-        return _learnt(following, np.where(known, residual, np.inf), params.factor), decision
+        run = np.where(present, 0, state.run) if state.run.any() else state.run
+        learnt = state.residuals.with_newest(newest, params.factor)
+        return state._replace(values=values, scores=scores, residuals=learnt, run=run), decision
 
     suspects = windows.pushed(state.suspects, z_near, suspicious)
-    run = np.where(suspicious, state.run + 1, following.run)
+    run = np.where(suspicious, state.run + 1, np.where(present, 0, state.run))
     released = suspicious & (run > params.release)
     if released.any():
-        bound = params.factor * np.fmax(noise, state.scale)
+        bound = params.factor * np.fmax(noise, state.residuals.scale)
         released &= windows.agree(suspects, bound) | (run > 2 * params.release)
     flagged = suspicious & ~released
     replacement, wide = _replacement(state.values, z_near, sigma, params)
-    values = following.values
     values[-1, flagged] = replacement[flagged]
     if released.any():
         values[:, released] = suspects[-len(values) :, released]
         scores[:, released] = _tried(suspects[:, released])
     size, learns = _moved(state, z_near, deviation, suspicious, run)
-    following = following._replace(
-        suspects=suspects,
-        deviation=np.where(suspicious, deviation, state.deviation),
-        run=np.where(released, 0, run),
-        releases=state.releases + released,
+    following = AdaptiveState(
+        values,
+        scores,
+        state.residuals.with_newest(np.where(known & learns, size, np.inf), params.factor),
+        suspects,
+        np.where(suspicious, deviation, state.deviation),
+        np.where(released, 0, run),
+        state.releases + released,
     )
     decision = Decision(
         flagged,
@@ -281,7 +257,7 @@ def step(
         statistic,
         threshold,
     )
-    return _learnt(following, np.where(known & learns, size, np.inf), params.factor), decision
+    return following, decision
 
 
 def screen(
@@ -378,30 +354,17 @@ def _moved(
     return np.where(moved, size, residual), moved | ~suspicious
 
 
-def _learnt(state: AdaptiveState, newest: FloatArray, factor: float) -> AdaptiveState:
-    """The state with the newest |r|, and with new scales once there are enough."""
-    recent = (*state.recent, newest)
-    if len(recent) < RENEWAL:
-        return state._replace(recent=recent)
-    rows = np.array(recent).T
-    at, step = np.nonzero(np.isfinite(rows))
-    number = state.learnt[:, None] + np.cumsum(np.isfinite(rows), axis=1)
-    residuals, scale = state.residuals.copy(), state.scale.copy()
-    residuals[at, (number[at, step] - 1) % MEMORY] = rows[at, step]
-    learnt = number[:, -1]
-    renewed = np.flatnonzero((learnt > state.learnt) & (learnt >= RENEWAL))
-    if len(renewed):
-        count = np.minimum(learnt[renewed], MEMORY)
-        scale[renewed] = tails.scale(residuals[renewed], count, factor)
-    return state._replace(recent=(), residuals=residuals, learnt=learnt, scale=scale)
-
-
-def _forecasts(values: FloatArray) -> FloatArray:
-    """What every forecast says, added in one order however many channels there are. (3, m)"""
-    return np.asarray(np.add.reduce(AHEAD[:, :, None] * values[-SPAN:], axis=1))
+def _deviations(values: FloatArray, z: FloatArray) -> FloatArray:
+    """What is left of z beyond every forecast of `AHEAD`, one small sum after the other. (3, m)"""
+    first, second, third, last = values[-SPAN:]
+    out = np.empty((len(AHEAD), len(z)))
+    np.subtract(z, last, out=out[1])
+    np.subtract(out[1], 0.5 * (third - first), out=out[0])
+    np.subtract(z, 0.25 * ((first + second) + (third + last)), out=out[2])
+    return out
 
 
 def _tried(suspects: FloatArray) -> FloatArray:
     """Mean |r| of every forecast along a run of values."""
-    ahead = [np.abs(suspects[k] - _forecasts(suspects[:k])) for k in range(SPAN, len(suspects))]
+    ahead = [np.abs(_deviations(suspects[:k], suspects[k])) for k in range(SPAN, len(suspects))]
     return np.asarray(np.mean(ahead, axis=0))

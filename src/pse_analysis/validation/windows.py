@@ -12,7 +12,7 @@ BoolArray = npt.NDArray[np.bool_]
 def near(z: FloatArray, last: FloatArray, turn: FloatArray | float) -> FloatArray:
     """Samples, with angles turned by whole turns to the last value of their channel."""
     beyond = z - last
-    far = 2.0 * np.abs(beyond) > turn
+    far = np.abs(beyond) > 0.5 * turn
     if not far.any():
         return z
     full = np.broadcast_to(turn, z.shape)[far]
@@ -28,7 +28,8 @@ def weighted(weight: npt.NDArray[np.floating], rows: FloatArray) -> FloatArray:
 
 def pushed(past: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
     """The past with a new row at its end, in some columns."""
-    return np.where(where, np.concatenate([past[1:], new[None]]), past)
+    moved = np.concatenate([past[1:], new[None]])
+    return moved if where.all() else np.where(where, moved, past)
 
 
 def agree(suspects: FloatArray, bound: FloatArray) -> BoolArray:
