@@ -291,6 +291,7 @@ def test_xcorr_says_what_it_rests_on():
         ({"window_s": 300.0, "largest_delay_s": 240.0}, "at least twice"),
         ({"warp_penalty": -1.0}, "warp_penalty must not be negative"),
         ({"lag_window_s": 0.0}, "lag_window_s must be positive"),
+        ({"lenders": 1}, "lenders = 0 or at least 2"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(change: dict[str, float], message: str):

@@ -1,15 +1,19 @@
-"""Claim: all channels of a device share a recovered delay, also where one half of it is lost."""
+"""Claim: channels of a device share a delay, devices of a source lend one to whom none is known."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import datetime, timedelta
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 from simulated_case import STUDY, curves, feeder
 
 from pse_analysis.alignment import fusion, stamps
-from pse_analysis.alignment.dtw import DTW, Method, TimeParams
+from pse_analysis.alignment.dtw import DTW, NONE, Method, TimeParams
 from pse_analysis.alignment.stamps import SamplingTimes
 from pse_analysis.measurement import SensorLayout
 from pse_analysis.simulation import simulate
@@ -31,6 +35,9 @@ SENSORS = (
     SensorParams("scada", ("vm_pu",), ("bus/18",), 0.005, 60.0, delay_s=5.0),
 )  # fmt: skip
 
+NETWORKED = ("branch/7-8", "branch/15-16", "branch/24-25", "branch/31-32")
+LATERAL = "scada:branch/19-20"
+
 
 @cache
 def made() -> tuple[RawCase, pd.DataFrame]:
@@ -50,6 +57,39 @@ def recover(validated: pd.DataFrame, method: Method = "dtw") -> SamplingTimes:
         fusion.start_of(STUDY),
         PARAMS,
         method,
+    )
+
+
+@cache
+def networked() -> tuple[RawCase, pd.DataFrame]:
+    """Four devices with a phasor unit of their own and one without, on one network."""
+    phasor, telecontrol, _ = SENSORS
+    sensors = (
+        replace(phasor, at=NETWORKED),
+        replace(telecontrol, at=(*NETWORKED, "branch/19-20"), delay_s=60.0, wander_s=80.0),
+    )
+    raw = simulate(feeder(), curves(), STUDY, SimulateParams(SEED, sensors))
+    return raw, validate(raw.telemetry, raw.channels, ValidateParams(), history_end=STUDY.start)
+
+
+@cache
+def lent(lenders: int = 3, other: str = "scada", until: datetime | None = None) -> SamplingTimes:
+    """Stamps of `networked`, with the lateral in a source of its own if asked for."""
+    raw, validated = networked()
+    if until is not None:
+        validated = validated[(validated["arrival_utc"] <= until).to_numpy()]
+    source = raw.channels["source"].to_numpy(dtype=object)
+    source = np.where(raw.channels["channel"].str.startswith(LATERAL), other, source)
+    params = replace(PARAMS, sources=("scada", other), lenders=lenders)
+    layout = SensorLayout.from_channels(raw.channels, feeder())
+    return stamps.sampling_times(
+        validated,
+        layout,
+        source,
+        feeder(),
+        fusion.instants_of(STUDY),
+        fusion.start_of(STUDY),
+        params,
     )
 
 
@@ -100,6 +140,41 @@ def test_a_half_without_its_other_half_is_dated_by_the_samples_beside_it():
     error = (found.time[alone] - microseconds(true)) / 1e6
     late = (microseconds(kept[alone], "arrival_utc") - microseconds(true)) / 1e6
     assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(late**2))
+
+
+def test_a_device_of_which_nothing_is_known_has_the_usual_delay_of_the_others():
+    raw, validated = networked()
+    found, alone = lent(), lent(lenders=0)
+    lateral = rows(validated, LATERAL)
+    settled = lateral & (validated["arrival_utc"] >= STUDY.start).to_numpy()
+    assert (found.method[settled] == stamps.LENT).all()
+    assert not found.confidence[lateral].any()
+    scores = stamps.rms_errors(found, validated, raw.sample_truth, pd.Timestamp(STUDY.start))
+    own = scores[scores["device"].str.startswith(LATERAL)].set_index("method").loc["lent"]
+    assert own["rms_s"] < 0.5 * own["arrival_s"]
+    assert 0.5 < own["rms_s"] / np.sqrt(np.mean(found.doubt[settled] ** 2)) < 1.5
+    assert (alone.method[lateral] == NONE).all()
+    sure = found.method == DTW
+    assert sure.any()
+    np.testing.assert_array_equal(found.time[sure], alone.time[sure])
+
+
+@pytest.mark.parametrize("change", [{"other": "rtu"}, {"lenders": 5}], ids=str)
+def test_nothing_changes_where_devices_share_no_source_or_too_few_are_sure(
+    change: dict[str, Any],
+):
+    found, alone = lent(**change), lent(lenders=0)
+    for name in ("time", "confidence", "doubt", "method"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+
+
+def test_what_comes_later_changes_no_lent_stamp():
+    now = STUDY.start + timedelta(hours=1)
+    whole, before = lent(), lent(until=now)
+    kept = (networked()[1]["arrival_utc"] <= now).to_numpy()
+    assert (before.method == stamps.LENT).any()
+    for name in ("time", "doubt", "method"):
+        np.testing.assert_array_equal(getattr(whole, name)[kept], getattr(before, name))
 
 
 def test_without_a_method_all_stamps_stay():

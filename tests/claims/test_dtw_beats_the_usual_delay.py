@@ -14,7 +14,8 @@ import pandas as pd
 from simulated_case import curves, feeder
 
 from pse_analysis.alignment import fusion, stamps
-from pse_analysis.alignment.dtw import DTW, METHODS, NONE
+from pse_analysis.alignment.dtw import DTW, METHODS
+from pse_analysis.alignment.stamps import LENT
 from pse_analysis.measurement import SensorLayout
 from pse_analysis.pipeline.case import load_case
 from pse_analysis.pipeline.stages import check_case
@@ -33,7 +34,7 @@ def rms(errors: pd.Series) -> float:
 
 @cache
 def recovered(constant: bool = False) -> pd.DataFrame:
-    """Every telecontrol sample of the day with its errors [s], confidence and method."""
+    """Every telecontrol sample of the day with its errors and doubt [s], confidence and method."""
     case = check_case(load_case("qi2025"))
     end = case.study.start + timedelta(hours=6 if constant else 24)
     study = replace(case.study, history_s=43200.0, end=end)
@@ -56,7 +57,7 @@ def recovered(constant: bool = False) -> pd.DataFrame:
             validated, layout, source, feeder(), instants, start, case.align.time, how
         )
         table = table.assign(**{how: pd.to_datetime(found.time, unit="us", utc=True)})
-    table = table.assign(confidence=found.confidence, method=found.method)
+    table = table.assign(confidence=found.confidence, doubt=found.doubt, method=found.method)
     table = table[table["channel"].str.startswith("scada")]
     table = table[table["arrival_utc"] >= study.start]
     table = table.merge(raw.sample_truth[[*key, "time_utc"]], on=key)
@@ -81,18 +82,18 @@ def test_error_grows_as_confidence_falls_and_is_as_large_as_it_says():
     parts = np.array_split(np.arange(len(seen)), 4)
     errors = [rms(seen["dtw"].iloc[part]) for part in parts]
     assert errors == sorted(errors)
-    band = check_case(load_case("qi2025")).align.time.largest_delay_s
     sure = seen[seen["method"] == DTW]
-    claimed = (1.0 - sure["confidence"]) * band / np.sqrt(12.0)
-    assert 0.7 < rms(sure["dtw"]) / rms(claimed) < 1.3
+    assert 0.7 < rms(sure["dtw"]) / rms(sure["doubt"]) < 1.3
 
 
-def test_a_lateral_without_a_phasor_unit_in_series_is_left_alone():
+def test_a_lateral_without_a_phasor_unit_in_series_borrows_the_delay_of_the_others():
     table = recovered()
-    apart = table["channel"].str.startswith(LATERAL)
-    assert (table["method"][apart] == NONE).all()
-    assert not table["confidence"][apart].any()
-    np.testing.assert_array_equal(table["dtw"][apart], table["none"][apart])
+    apart = table[table["channel"].str.startswith(LATERAL)]
+    assert (apart["method"] == LENT).all()
+    assert not apart["confidence"].any()
+    assert rms(apart["dtw"]) < 0.5 * rms(apart["none"])
+    assert 0.8 < rms(apart["dtw"]) / rms(apart["doubt"]) < 1.25
+    assert (apart["dtw"].abs() <= 2 * apart["doubt"]).mean() > 0.93
 
 
 def test_with_a_constant_delay_it_is_no_worse_than_the_usual_delay_by_a_phasor_sample():
@@ -100,3 +101,7 @@ def test_with_a_constant_delay_it_is_no_worse_than_the_usual_delay_by_a_phasor_s
     table = table[~table["channel"].str.startswith(LATERAL)]
     assert rms(table["xcorr"]) < PHASOR_S
     assert rms(table["dtw"]) <= rms(table["xcorr"]) + PHASOR_S
+    borrowed = recovered(constant=True)
+    borrowed = borrowed[borrowed["method"] == LENT]
+    assert len(borrowed)
+    assert rms(borrowed["dtw"]) < PHASOR_S

@@ -67,7 +67,10 @@ class TimeParams:
         Confidence below which the usual delay stands instead of the match.
     least_correlation : float
         Correlation of the increments below which not even a usual delay is believed, and the stamp
-        is left alone.
+        is left alone, or has the usual delay of others.
+    lenders : int
+        Devices of one source that must be sure of their delays for another, of which nothing is
+        known, to have the same; 0 where devices do not share a network, and stamps stay alone.
     """
 
     sources: tuple[str, ...] = ("scada",)
@@ -77,6 +80,7 @@ class TimeParams:
     warp_penalty: float = 1.0
     least_confidence: float = 1.0 / 3.0
     least_correlation: float = 0.2
+    lenders: int = 3
 
     def __post_init__(self) -> None:
         for name in ("window_s", "largest_delay_s", "lag_window_s"):
@@ -88,11 +92,25 @@ class TimeParams:
             raise ParameterError(
                 f"[align] warp_penalty must not be negative, received {self.warp_penalty}"
             )
+        if self.lenders < 0 or self.lenders == 1:
+            raise ParameterError(
+                f"[align] expected lenders = 0 or at least 2, who can disagree, received "
+                f"{self.lenders}"
+            )
         if self.window_s < 2 * self.largest_delay_s:
             raise ParameterError(
                 f"[align] window_s = {self.window_s:g} holds no match: expected at least twice "
                 f"largest_delay_s = {self.largest_delay_s:g}"
             )
+
+    @property
+    def ignorant_s(self) -> float:
+        """Standard deviation of a delay that may be anything in the band. [s]"""
+        return self.largest_delay_s / float(np.sqrt(12.0))
+
+    def sure(self, confidence: FloatArray) -> npt.NDArray[np.bool_]:
+        """Which stamps are confident."""
+        return np.asarray((confidence >= self.least_confidence) & (confidence > 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +123,8 @@ class Stamps:
         Arrival minus sampling time. [s]
     confidence : (n,) ndarray
         1 - (spread left)/(spread of a delay that may be anything in the band).
+    doubt : (n,) ndarray
+        That spread; half the band where confidence is 0. [s]
     method : (n,) ndarray of int8
         What the delay rests on: index into `METHODS`. ``dtw`` wherever it is confident, but for a
         device whose delay does not vary.
@@ -112,7 +132,14 @@ class Stamps:
 
     delay: FloatArray
     confidence: FloatArray
+    doubt: FloatArray
     method: npt.NDArray[np.int8]
+
+    @classmethod
+    def untouched(cls, n: int, params: TimeParams) -> Stamps:
+        """Stamps that are left alone: late by anything in the band."""
+        late = np.full(n, 0.5 * params.largest_delay_s)
+        return cls(np.zeros(n), np.zeros(n), late, np.zeros(n, dtype=np.int8))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +245,7 @@ def recover(
         What no correlation supports is left alone, with confidence 0.
     """
     n = len(arrival)
-    stamps = Stamps(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int8))
+    stamps = Stamps.untouched(n, params)
     known = np.isfinite(value)
     enough = min(known.sum(), len(reference.time)) >= lag.FEWEST
     if method == "none" or not enough:
@@ -246,10 +273,11 @@ def recover(
     varies = _varies(device, usual, np.where(np.isfinite(mean), mean, usual), begin, params)
     share = np.where(np.isfinite(path) & (apart > 0), spread**2 / (spread**2 + apart**2), 0.0)
     mean = mean + np.where(share > 0, share * (path - mean), 0.0)
-    ignorant = params.largest_delay_s / np.sqrt(12.0)
-    confidence = np.clip(1.0 - np.hypot(spread, 0.3 * reference.step) / ignorant, 0.0, 1.0)
-    stamps.confidence[:] = np.where(believed & np.isfinite(mean), confidence, 0.0)
-    sure = varies & (stamps.confidence >= params.least_confidence) & (stamps.confidence > 0)
+    left = np.hypot(spread, 0.3 * reference.step)
+    confidence = np.clip(1.0 - left / params.ignorant_s, 0.0, 1.0)
+    told = believed & (confidence > 0)
+    stamps.confidence[told], stamps.doubt[told] = confidence[told], left[told]
+    sure = varies & params.sure(stamps.confidence)
     stamps.delay[sure] = mean[sure]
     stamps.method[sure] = DTW
     return stamps

@@ -197,11 +197,8 @@ def _fuse(
     own = samples.noise(row, layout)
     grown = np.zeros(len(row))
     rate = np.zeros(int(samples.group.max(initial=-1)) + 1)
-    # A stamp that is off by δ reads a walk that has moved by r |δ|. One that was left alone is late
-    # by anything in the band.
-    longest = params.time.largest_delay_s
-    left = (1.0 - samples.confidence) * longest / np.sqrt(12.0)
-    doubt = np.where(samples.confidence > 0, left, 0.5 * longest)
+    # A stamp that is off by δ reads a walk that has moved by r |δ|.
+    doubt = samples.doubt
     if params.growth == "history":
         rate = samples.movement(layout, start_of(study), study.step_s)
         own = np.sqrt(own**2 + rate[samples.group[row]] * doubt[row])

@@ -41,8 +41,8 @@ class Samples:
     group, trial, column : (n,) ndarray of int
         Number of the group, its trial and its row of the layout.
     time, arrival : (n,) ndarray of int
-    confidence : (n,) ndarray
-        Of a recovered sampling time.
+    confidence, doubt : (n,) ndarray
+        Of a recovered sampling time, and its standard deviation. [1, s]
     value : (n,) ndarray
         [p.u., rad]
     flag, reasons : (n,) ndarray of int
@@ -54,6 +54,7 @@ class Samples:
     time: IntArray
     arrival: IntArray
     confidence: FloatArray
+    doubt: FloatArray
     value: FloatArray
     flag: npt.NDArray[np.int8]
     reasons: npt.NDArray[np.int32]
@@ -85,12 +86,13 @@ class Samples:
         place = np.asarray(column[keep], dtype=np.int64)
         time = microseconds(rows["time_utc"])
         came = rows["arrival_utc"].isna().to_numpy()
-        confidence = np.ones(len(rows))
+        confidence, doubt = np.ones(len(rows)), np.zeros(len(rows))
         arrival = np.where(came, time, microseconds(rows["arrival_utc"].fillna(rows["time_utc"])))
         # A stamp ahead of its arrival, from a clock that is fast or wrong, waits for its time.
         arrival = np.maximum(arrival, time)
         if stamps is not None:
-            time, confidence = stamps.time[keep], stamps.confidence[keep]
+            time, doubt = stamps.time[keep], stamps.doubt[keep]
+            confidence = stamps.confidence[keep]
         order = np.lexsort((rows["seq"].to_numpy(), arrival, place, trial))
         _, group = np.unique(trial[order] * len(layout) + place[order], return_inverse=True)
         group = group.astype(np.int64)
@@ -105,6 +107,7 @@ class Samples:
             time=time[order],
             arrival=arrival[order],
             confidence=confidence[order],
+            doubt=doubt[order],
             value=value[keep][order],
             flag=rows["flag"].to_numpy(dtype=np.int8)[order],
             reasons=rows["reasons"].to_numpy(dtype=np.int32)[order],

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.alignment import dtw, lag
-from pse_analysis.alignment.dtw import METHODS, Method, TimeParams
+from pse_analysis.alignment import dtw, lag, lending
+from pse_analysis.alignment.dtw import METHODS, NONE, Method, Stamps, TimeParams
 from pse_analysis.alignment.lag import Reference
+from pse_analysis.alignment.lending import Lender
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, IM, TO, P, Q, SensorLayout, standard_deviation
 from pse_analysis.vocabulary import usable
@@ -22,6 +23,9 @@ IntArray = npt.NDArray[np.int64]
 MICROSECOND = 1_000_000
 ALONE = 0.5
 """Correlation that a partner must show which is not in series with the device."""
+RESTS_ON: tuple[str, ...] = (*METHODS, "lent")
+"""What a stamp may rest on: one of the methods, or the usual delays of other devices."""
+LENT = len(METHODS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +38,31 @@ class SamplingTimes:
         Microseconds since 1970 UTC.
     confidence : (n,) ndarray
         1 where the stamp is the source's own and nothing was asked; else from
-        `pse_analysis.alignment.dtw.Stamps`.
+        `pse_analysis.alignment.dtw.Stamps`, so 0 where the delay is lent.
+    doubt : (n,) ndarray
+        Standard deviation of the stamp; half the largest delay where it is left alone. [s]
     method : (n,) ndarray of int8
-        Index into `pse_analysis.alignment.dtw.METHODS`.
+        Index into `RESTS_ON`.
     partner : dict of str to str
         Channel that each device was matched with; absent where there is none.
     """
 
     time: IntArray
     confidence: FloatArray
+    doubt: FloatArray
     method: npt.NDArray[np.int8]
     partner: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Dated:
+    """Stamps of one device: of its rows in the table, each at a position among its arrivals."""
+
+    source: str
+    rows: IntArray
+    at: IntArray
+    arrival: FloatArray
+    found: Stamps
 
 
 def sampling_times(
@@ -82,12 +100,14 @@ def sampling_times(
     Notes
     -----
     Only samples of ``params.sources`` whose stamp is their arrival change. All channels of one
-    device share its delays, because they arrive together.
+    device share its delays, because they arrive together. What ``dtw`` would leave alone is late by
+    what the other devices of its source usually are, where enough of them are sure of theirs and
+    agree (`pse_analysis.alignment.lending`).
     """
     params = params or TimeParams()
     n = len(validated)
     stamp, arrival = (microseconds(validated[c]) for c in ("time_utc", "arrival_utc"))
-    out = SamplingTimes(stamp.copy(), np.ones(n), np.zeros(n, dtype=np.int8), {})
+    out = SamplingTimes(stamp.copy(), np.ones(n), np.zeros(n), np.zeros(n, dtype=np.int8), {})
     if method == "none" or not n:
         return out
     column = pd.Index(layout.channel).get_indexer(validated["channel"])
@@ -108,27 +128,33 @@ def sampling_times(
             layout, source, column, (stamp - base) / MICROSECOND, (arrival - base) / MICROSECOND,
             value, mine & good,
         )  # fmt: skip
+        dated = []
         for place in np.unique(device[column[mine & clockless]]):
             rows = np.flatnonzero(mine & clockless & (device[column] == place))
+            spot = int(column[rows[0]])
             came, current, sigma = _current(layout, column, arrival, value, rows, good)
             when = (came - base) / MICROSECOND
             if place not in chosen:
-                spot = int(column[rows[0]])
                 chosen[place] = _ranked(
                     network, layout, spot, references, when, current, params, study_begins
                 )
-            out.confidence[rows] = 0.0
-            if not chosen[place]:
-                continue
-            name = layout.channel[int(column[rows[0]])].rsplit(":", 1)[0]
-            partner = chosen[place][0]
-            out.partner[name] = layout.channel[partner]
-            if partner not in references:
-                continue
-            found = dtw.recover(when, current, sigma, references[partner], seconds, params, method)
+            found = Stamps.untouched(len(when), params)
+            if chosen[place]:
+                partner = chosen[place][0]
+                out.partner[layout.channel[spot].rsplit(":", 1)[0]] = layout.channel[partner]
+                if partner in references:
+                    found = dtw.recover(
+                        when, current, sigma, references[partner], seconds, params, method
+                    )
             at = np.searchsorted(came, arrival[rows])
+            dated.append(_Dated(str(source[spot]), rows, at, when, found))
+        if method == "dtw":
+            _lend(dated, seconds, params)
+        for one in dated:
+            rows, at, found = one.rows, one.at, one.found
             out.time[rows] = arrival[rows] - np.rint(found.delay[at] * MICROSECOND).astype(np.int64)
             out.confidence[rows] = found.confidence[at]
+            out.doubt[rows] = found.doubt[at]
             out.method[rows] = found.method[at]
     return out
 
@@ -150,14 +176,16 @@ def rms_errors(
     -------
     DataFrame
         ``device``, ``method`` that the stamp rests on, ``count``, ``rms_s`` of it and ``arrival_s``
-        of the arrival taken for the sampling time; devices that stamp themselves are left out.
+        of the arrival taken for the sampling time; devices with neither a partner nor a lent delay
+        are left out.
     """
     key = ["trial", "channel", "seq"]
     frame = validated[[*key, "arrival_utc"]].assign(
-        time=times.time, how=np.array(METHODS, dtype=object)[times.method], sure=times.confidence
+        time=times.time, how=np.array(RESTS_ON, dtype=object)[times.method]
     )
     frame["device"] = frame["channel"].str.rsplit(":", n=1).str[0]
-    frame = frame[frame["device"].isin(times.partner) & (frame["arrival_utc"] >= since)]
+    known = {*times.partner, *frame["device"][times.method != NONE]}
+    frame = frame[frame["device"].isin(known) & (frame["arrival_utc"] >= since)]
     frame = frame.merge(sample_truth[[*key, "time_utc"]], on=key)
     true = microseconds(frame["time_utc"])
     frame["error"] = (frame["time"] - true) / MICROSECOND
@@ -170,6 +198,31 @@ def rms_errors(
             "arrival_s": grouped["late"].apply(_rms),
         }
     ).reset_index(names=["device", "method"])
+
+
+def _lend(dated: list[_Dated], instants: FloatArray, params: TimeParams) -> None:
+    """Let samples that were left alone have the usual delay of the other devices of their source.
+
+    What is lent has confidence 0, so nobody lends it on and the order of devices does not matter.
+    """
+    for one in dated:
+        alone = np.flatnonzero(one.found.method == NONE)
+        others = [m for m in dated if m is not one and m.source == one.source]
+        if not len(alone) or not params.lenders:
+            continue
+        lenders = [
+            Lender(m.arrival[sure], m.found.delay[sure], m.found.doubt[sure])
+            for m, sure in ((m, params.sure(m.found.confidence)) for m in others)
+        ]
+        delay, sigma = lending.lend(
+            lenders, instants, params.lag_window_s, params.ignorant_s, params.lenders
+        )
+        # As known at the first instant after the arrival, like every other stamp.
+        when = np.minimum(np.searchsorted(instants, one.arrival[alone]), len(instants) - 1)
+        lent = np.isfinite(delay[when])
+        alone, when = alone[lent], when[lent]
+        one.found.delay[alone], one.found.doubt[alone] = delay[when], sigma[when]
+        one.found.method[alone] = LENT
 
 
 def _rms(values: pd.Series) -> float:
