@@ -11,7 +11,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pse_analysis.estimation.estimator import Snapshot, run
+from pse_analysis.estimation.driver import run
+from pse_analysis.estimation.estimator import Snapshot
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import LoadStatistics, load_noise
 from pse_analysis.grid import library

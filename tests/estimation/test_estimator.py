@@ -13,17 +13,11 @@ from reference import channels_table
 
 from pse_analysis.errors import TableError
 from pse_analysis.estimation import Method, estimate
-from pse_analysis.estimation.estimator import (
-    Estimator,
-    Info,
-    Record,
-    Snapshot,
-    Voltages,
-    record,
-    run,
-)
+from pse_analysis.estimation.driver import run
+from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import scalar_noise
+from pse_analysis.estimation.records import Record, record
 from pse_analysis.estimation.wls import tracking_wls
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve

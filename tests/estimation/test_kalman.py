@@ -10,9 +10,11 @@ import pytest
 
 from pse_analysis import parameters
 from pse_analysis.estimation import Method, build
-from pse_analysis.estimation.estimator import Estimator, Info, Record, Snapshot, run
+from pse_analysis.estimation.driver import run
+from pse_analysis.estimation.estimator import Estimator, Info, Snapshot
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import scalar_noise
+from pse_analysis.estimation.records import Record
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve

@@ -10,7 +10,7 @@ from qu_bench import Bench, gross_errors, still
 
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.composition import Composition, build, scalar
-from pse_analysis.estimation.estimator import run
+from pse_analysis.estimation.driver import run
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.process import scalar_noise
 from pse_analysis.estimation.start import begin, robust_wls

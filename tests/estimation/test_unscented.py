@@ -12,7 +12,7 @@ from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.estimation import conditioning, gaussian, holt, noise, unscented
 from pse_analysis.estimation.composition import Composition, build, scalar
 from pse_analysis.estimation.conditioning import Prior
-from pse_analysis.estimation.estimator import run
+from pse_analysis.estimation.driver import run
 from pse_analysis.estimation.noise import Learnt, sage_husa
 from pse_analysis.estimation.replay import EPOCH, replay
 from pse_analysis.estimation.unscented import Scaling

@@ -19,9 +19,11 @@ from pse_analysis.estimation import (
     screening,
 )
 from pse_analysis.estimation.composition import Composition
-from pse_analysis.estimation.estimator import Estimated, Estimator, Record, States, record, run
+from pse_analysis.estimation.driver import Estimated, States, run
+from pse_analysis.estimation.estimator import Estimator
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.noise import of_grid
+from pse_analysis.estimation.records import Record, record
 from pse_analysis.estimation.wls import state_columns, tracking_wls
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
@@ -30,7 +32,16 @@ from pse_analysis.parameters import Study
 from pse_analysis.validation.adaptive import AdaptiveParams
 from pse_analysis.vocabulary import check
 
-__all__ = ["EstimateParams", "Estimated", "Estimator", "Method", "Record", "build", "estimate"]
+__all__ = [
+    "EstimateParams",
+    "Estimated",
+    "Estimator",
+    "Method",
+    "Record",
+    "build",
+    "estimate",
+    "record",
+]
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, optimize, signal
 
-from pse_analysis.estimation.estimator import Record
 from pse_analysis.estimation.process import LoadStatistics, Sensitivity, to_polar
+from pse_analysis.estimation.records import Record
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VM, P, Q, SensorLayout, standard_deviation

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Record, Snapshot
+from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Snapshot
+from pse_analysis.estimation.records import Record
 from pse_analysis.measurement import IA, VA, SensorLayout
 from pse_analysis.validation import adaptive
 from pse_analysis.validation.adaptive import AdaptiveParams, AdaptiveState
