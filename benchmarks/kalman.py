@@ -9,11 +9,12 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from benchmarks.timing import Row, alternate
-from pse_analysis.estimation import intervals, matching, refusal
+from pse_analysis.estimation import intervals, matching, refusal, screening
 from pse_analysis.estimation.estimator import Estimator, Snapshot
 from pse_analysis.estimation.holt import local_trend
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import LoadStatistics, ProcessNoise, load_noise
+from pse_analysis.estimation.records import Record
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import (
@@ -26,9 +27,12 @@ from pse_analysis.measurement import (
     RectangularModel,
     SensorLayout,
 )
+from pse_analysis.validation.adaptive import AdaptiveParams
 
 SEED = 33
 STEP_S = 300.0
+STEPS = 288
+NOON = np.datetime64("2016-06-09T12:00:00", "us")
 REPEATS = 51
 LAGS = 4
 NETWORK = library.load("ieee33")
@@ -66,6 +70,7 @@ def run() -> list[Row]:
         ("local trend", instant, {"instant": True, "process": local_trend()}),
     ):
         rows.append(beside(name, made(layout, noise, **options), plain, now))
+    rows.append(behind_threshold(layout, instant))
     learning = made(layout, matching.of_loads(NETWORK), instant=True)
     rows.append(beside("noise from innovations", learning, instant, now))
     state, _ = interval.init(now)
@@ -98,7 +103,7 @@ def snapshot(layout: SensorLayout) -> Snapshot:
     on, zero = np.ones(len(layout), dtype=bool), np.zeros(len(layout))
     age = np.where(layout.window_s > 0, 60.0, np.where(layout.quantity == VM, 1.0, 7.0))
     age = np.where(layout.quantity == VA, 1.0, age)
-    return Snapshot(np.datetime64("2016-06-09T12:00:00", "us"), z, sigma, zero, on, on, age)
+    return Snapshot(NOON, z, sigma, zero, on, on, age)
 
 
 def made(layout: SensorLayout, noise: object, **options: object) -> Estimator:
@@ -111,6 +116,38 @@ def beside(name: str, ours: Estimator, plain: Estimator, now: Snapshot) -> Row:
     mine, theirs = ours.init(now)[0], plain.init(now)[0]
     times = alternate(lambda: ours.step(mine, now), lambda: plain.step(theirs, now), 3 * REPEATS)
     return Row(f"Kalman step, ieee33, {name}", *times, "plain step", "")
+
+
+def behind_threshold(layout: SensorLayout, plain: Estimator) -> Row:
+    """A day of steps behind the adaptive threshold of every channel beside the same without it."""
+    days = series(layout, 2 * STEPS)
+    past, snapshots = days.between(None, NOON), list(days.between(NOON, None).snapshots())
+    ours = screening.screened(plain, layout, AdaptiveParams(), past)
+
+    def through(estimator: Estimator) -> Callable[[], None]:
+        begun = estimator.init(snapshots[0])[0]
+
+        def run() -> None:
+            state = begun
+            for now in snapshots[1:]:
+                state, _ = estimator.step(state, now)
+
+        return run
+
+    times = [t / (STEPS - 1) for t in alternate(through(ours), through(plain), 7)]
+    what = "Kalman step, ieee33, behind an adaptive threshold, mean of a day"
+    return Row(what, *times, "plain step", "expected: at least 0.83 ×")
+
+
+def series(layout: SensorLayout, steps: int) -> Record:
+    """Noise about one state, a day of it before noon; meters report at every third instant."""
+    now = snapshot(layout)
+    rng = np.random.default_rng(SEED)
+    z = now.z + now.sigma * rng.normal(size=(steps, len(layout)))
+    time = NOON + (np.arange(steps) - steps // 2) * np.timedelta64(int(STEP_S), "s")
+    fresh = (layout.window_s == 0) | (np.arange(steps) % 3 == 0)[:, None]
+    wide, zero = (np.broadcast_to(part, z.shape) for part in (now.sigma, now.sigma_age))
+    return Record(time, z, wide, zero, np.ones(z.shape, dtype=bool), fresh, 0.0 * z + now.age_s)
 
 
 def textbook(
