@@ -14,6 +14,7 @@ from study_tables import VM_BUSES, StudyTables, study_tables
 
 from pse_analysis import drawing, recording
 from pse_analysis.grid import library
+from pse_analysis.recording import Take
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +35,15 @@ def _record(to: Path, t: StudyTables, *, known: bool) -> None:
     to.mkdir()
     truth = t.truth if known else None
     recording.validated(
-        to / "validate.rrd",
-        "demo",
+        Take(to / "validate.rrd", "demo", t.study),
         t.validated,
         t.channels,
         sample_truth=t.sample_truth if known else None,
         faults=t.faults if known else None,
-        study=t.study,
     )
-    recording.aligned(to / "align.rrd", "demo", t.aligned, t.channels, truth=truth)
+    recording.aligned(Take(to / "align.rrd", "demo"), t.aligned, t.channels, truth=truth)
     recording.estimated(
-        to / "estimate.rrd",
-        "demo",
+        Take(to / "estimate.rrd", "demo"),
         t.estimated,
         t.steps,
         t.residuals,
@@ -56,7 +54,12 @@ def _record(to: Path, t: StudyTables, *, known: bool) -> None:
     )
     scored = t.scored if known else t.scored[t.scored.metric == "nis_ratio"]
     recording.scored(
-        to / "score.rrd", "demo", scored, t.estimated, truth, t.network, summary_markdown="# s"
+        Take(to / "score.rrd", "demo"),
+        scored,
+        t.estimated,
+        truth,
+        t.network,
+        summary_markdown="# s",
     )
 
 
@@ -133,8 +136,7 @@ def test_a_method_that_never_ended_well_is_recorded_all_the_same(tables, tmp_pat
     steps.loc[steps.method == "wls", ["nis", "dof"]] = [np.nan, 0]
     steps["dof"] = steps.dof.astype("int32")
     recording.estimated(
-        tmp_path / "e.rrd",
-        "demo",
+        Take(tmp_path / "e.rrd", "demo"),
         lost,
         steps,
         tables.residuals[tables.residuals.method != "wls"],
@@ -150,7 +152,7 @@ def test_a_method_that_never_ended_well_is_recorded_all_the_same(tables, tmp_pat
 
 def test_more_channels_than_lanes_leaves_those_with_findings(tables, tmp_path, monkeypatch):
     monkeypatch.setattr(recording.telemetry, "MAX_LANES", 5)
-    recording.validated(tmp_path / "v.rrd", "demo", tables.validated, tables.channels)
+    recording.validated(Take(tmp_path / "v.rrd", "demo"), tables.validated, tables.channels)
     lanes = {e for e in entities(tmp_path / "v.rrd") if e.startswith("flags/")}
     flagged = tables.validated[(tables.validated.trial == 0) & (tables.validated.flag > 0)]
     assert len(lanes) == 5
@@ -158,7 +160,7 @@ def test_more_channels_than_lanes_leaves_those_with_findings(tables, tmp_path, m
 
 
 def test_recording_prints_nothing(tables, tmp_path, capfd):
-    recording.aligned(tmp_path / "a.rrd", "demo", tables.aligned, tables.channels)
+    recording.aligned(Take(tmp_path / "a.rrd", "demo"), tables.aligned, tables.channels)
     assert capfd.readouterr().out == ""
 
 

@@ -13,6 +13,7 @@ from rerun.chunk import RrdReader
 from study_tables import StudyTables, study_tables
 
 from pse_analysis import recording
+from pse_analysis.recording import Take
 from pse_analysis.recording.detection import N_BIN, _by_size
 from pse_analysis.vocabulary import Flag
 
@@ -28,13 +29,11 @@ def record(tables: StudyTables, path: Path, *, known: bool) -> set[str]:
     """Entity paths of the recording."""
     decided = tables.validated.assign(statistic=0.1, threshold=0.15)
     recording.detected(
-        path,
-        "demo",
+        Take(path, "demo", tables.study),
         decided,
         tables.channels,
         tables.faults if known else None,
         summary_markdown="# s",
-        study=tables.study,
     )
     chunks = RrdReader(str(path)).stream().to_chunks()
     return {str(chunk.entity_path).lstrip("/") for chunk in chunks}

@@ -25,6 +25,7 @@ from pse_analysis.pipeline.plan import SUMMARY, Job, Work
 from pse_analysis.pipeline.processes import each
 from pse_analysis.pipeline.summary import markdown, text
 from pse_analysis.pipeline.tables import merge_files, read_raw_table, write_empty
+from pse_analysis.recording import Take
 from pse_analysis.scoring import ScoreParams, observers, score
 from pse_analysis.simulation import (
     MachineSimulateParams,
@@ -133,13 +134,11 @@ def _validate(job: Job) -> None:
     write_table(job.output / "validated.parquet", validated, "validated")
     job.progress(3, 4, "recording")
     recording.validated(
-        job.output / "validate.rrd",
-        job.case.name,
+        Take(job.output / "validate.rrd", job.case.name, params.study),
         validated,
         raw.channels,
         sample_truth=raw.sample_truth,
         faults=raw.faults,
-        study=params.study,
     )
 
 
@@ -154,12 +153,10 @@ def _align(job: Job) -> None:
     write_table(job.output / "aligned.parquet", aligned, "aligned")
     job.progress(3, 4, "recording")
     recording.aligned(
-        job.output / "align.rrd",
-        job.case.name,
+        Take(job.output / "align.rrd", job.case.name, params.study),
         aligned,
         channels,
         truth=read_raw_table(job.raw, "truth"),
-        study=params.study,
     )
 
 
@@ -225,19 +222,16 @@ def _estimate(job: Job) -> None:
     model = read_model(job.raw)
     if isinstance(model, Machine):
         recording.machine_estimated(
-            job.output / "estimate.rrd",
-            job.case.name,
+            Take(job.output / "estimate.rrd", job.case.name, params.study),
             tables["estimated"],
             tables["steps"],
             aligned=read_table(aligned, "aligned"),
             channels=_channels(job.raw),
             truth=read_raw_table(job.raw, "truth"),
-            study=params.study,
         )
         return
     recording.estimated(
-        job.output / "estimate.rrd",
-        job.case.name,
+        Take(job.output / "estimate.rrd", job.case.name, params.study),
         tables["estimated"],
         tables["steps"],
         tables["residuals"],
@@ -245,7 +239,6 @@ def _estimate(job: Job) -> None:
         channels=_channels(job.raw),
         network=model,
         truth=read_raw_table(job.raw, "truth"),
-        study=params.study,
     )
 
 
@@ -278,34 +271,28 @@ def _score(job: Job) -> None:
     job.progress(2, 3, "recording")
     if not params.estimate.methods:
         recording.detected(
-            job.output / "score.rrd",
-            job.case.name,
+            Take(job.output / "score.rrd", job.case.name, params.study),
             validated,
             _channels(job.raw),
             faults,
             summary_markdown=markdown(job.case.title, scored),
-            study=params.study,
         )
         return
     if isinstance(model, Machine):
         recording.machine_scored(
-            job.output / "score.rrd",
-            job.case.name,
+            Take(job.output / "score.rrd", job.case.name, params.study),
             tables["estimated"],
             truth,
             summary_markdown=markdown(job.case.title, scored),
-            study=params.study,
         )
         return
     recording.scored(
-        job.output / "score.rrd",
-        job.case.name,
+        Take(job.output / "score.rrd", job.case.name, params.study),
         scored,
         tables["estimated"],
         truth,
         model,
         summary_markdown=markdown(job.case.title, scored),
-        study=params.study,
     )
 
 

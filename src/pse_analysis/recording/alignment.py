@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 import rerun as rr
 import rerun.blueprint as rrb
 
 from pse_analysis.drawing import GREEN, GREY, ORANGE, PURPLE, SOURCES
-from pse_analysis.recording import stream as marks
-from pse_analysis.recording.tables import MAX_LANES, coded, of_trial, open_on
-
-if TYPE_CHECKING:
-    from pse_analysis.parameters import Study
+from pse_analysis.recording import marks, views
+from pse_analysis.recording.take import MAX_LANES, Take, coded
 
 _ORIGINS = {"measured": GREEN, "held": "#3B5A50", "pseudo": ORANGE, "replaced": PURPLE}
 _AXIS = {
@@ -31,45 +26,35 @@ _AXIS = {
 
 
 def aligned(
-    path: str | Path,
-    case: str,
+    take: Take,
     aligned: pd.DataFrame,
     channels: pd.DataFrame,
     *,
     truth: pd.DataFrame | None = None,
-    study: Study | None = None,
     elements: Sequence[str] | None = None,
     variant: str | None = None,
-    trial: int = 0,
 ) -> None:
     """Record what each instant had to work with.
 
     Parameters
     ----------
-    path : str or Path
-        The ``.rrd`` file to write.
-    case : str
-        Name of the case.
+    take : Take
     aligned, channels, truth : DataFrame
         Tables of these names; `truth` is known for simulated cases only.
-    study : Study, optional
-        The plots open on its window; without it, on the whole record.
     elements : sequence of str, optional
         Elements to plot, such as ``bus/18``; default: four, those with a measured voltage first.
     variant : str, optional
         Variant to draw; default: the first.
-    trial : int
-        Trial to draw.
     """
-    table = of_trial(aligned, trial)
+    table = take.of(aligned)
     if variant is None and len(table):
         variant = str(table.variant.iloc[0])
     table = table[table.variant == variant].merge(
         channels[["channel", "source", "quantity", "element"]], on="channel", how="left"
     )
     table = coded(table, "channel", "source", "quantity", "element", "origin")
-    true = None if truth is None else of_trial(truth, trial)
-    window = open_on(table.time_utc, study)
+    true = None if truth is None else take.of(truth)
+    window = take.window(table.time_utc)
     chosen = list(elements) if elements is not None else _best_metered(table)
     pairs = [
         (element, str(quantity))
@@ -98,22 +83,20 @@ def aligned(
     few = set(oldest.index[:MAX_LANES])
     shown = [str(name) for name in channels.channel if name in few]
 
-    blueprint = marks.panels(
-        rrb.Horizontal(
-            rrb.Vertical(
-                rrb.Tabs(*series, name="values"),
-                rrb.Horizontal(
-                    window.plot("available", "channels with a value", number, zero=True),
-                    window.plot("age", "mean age of the values [s]", age, zero=True),
-                ),
-                window.lanes("origin", "origin by channel"),
-                row_shares=[4, 3, 5],
+    blueprint = views.columns(
+        rrb.Vertical(
+            rrb.Tabs(*series, name="values"),
+            rrb.Horizontal(
+                window.plot("available", "channels with a value", number, zero=True),
+                window.plot("age", "mean age of the values [s]", age, zero=True),
             ),
-            rrb.TextDocumentView(origin="text/aligned", name="what the instants hold"),
-            column_shares=[5, 2],
-        )
+            window.lanes("origin", "origin by channel"),
+            row_shares=[4, 3, 5],
+        ),
+        views.page("text/aligned", "what the instants hold"),
+        shares=[5, 2],
     )
-    with marks.recording(path, case, blueprint) as stream:
+    with take.open(blueprint) as stream:
         for element, quantity in pairs:
             own = table[(table.element == element) & (table.quantity == quantity)]
             _draw_aligned(stream, marks.entity_path("aligned", element, quantity), own, true)
@@ -132,7 +115,7 @@ def aligned(
                 _ORIGINS,
                 list(_ORIGINS)[:2],
             )
-        text = _aligned_text(case, trial, variant, table, len(channels), len(shown), true)
+        text = _aligned_text(take, variant, table, len(channels), len(shown), true)
         marks.page(stream, "text/aligned", text)
 
 
@@ -143,7 +126,7 @@ def _draw_aligned(
     # Of a grid's true values only |V| has the unit of the aligned ones without the base power.
     if true is not None and quantity in ("vm_pu", "rotor_angle_rad"):
         line = true[(true.element == own.element.iloc[0]) & (true.quantity == quantity)]
-        frame = pd.DataFrame({"true value": line.value.to_numpy()}, index=line.time_utc)
+        frame = marks.named("true value", line.time_utc, line.value)
         marks.lines(stream, f"{entity}/true", frame, [marks.TRUTH], width=2.5)
     for channel, one in own.groupby("channel", sort=False, observed=True):
         source = str(one.source.iloc[0])
@@ -156,14 +139,13 @@ def _draw_aligned(
 
 
 def _aligned_text(
-    case: str,
-    trial: int,
+    take: Take,
     variant: str | None,
     table: pd.DataFrame,
     n_channel: int,
     n_shown: int,
     true: pd.DataFrame | None,
-) -> str:
+) -> list[str]:
     rows = [
         (
             str(source),
@@ -177,20 +159,19 @@ def _aligned_text(
     ]
     some = " (those with the oldest values)" if n_shown < table.channel.nunique() else ""
     head = ("source", "channels", "values", "new", "mean age", "oldest")
-    return "\n\n".join(
-        [
-            f"# {case}: values at the instants",
-            f"Trial {trial} of the case, variant `{variant}`: {table.time_utc.nunique():,} "
-            f"instants. {table.channel.nunique()} of {n_channel} channels ever have a value; "
-            f"{n_shown} have a lane{some}.",
-            marks.markdown_table(head, rows),
-            "**Above**, one tab each: values in per unit with their ±σ band, which grows with age."
-            + ("" if true is None else " The grey line is the true value."),
-            "**Middle**: how many channels of each source have a value, and how old it is.",
-            "**Below**, a lane per channel: bright green is a new measurement, dark green one that "
-            "is used again; a gap means that no value was young enough.",
-        ]
-    )
+    return [
+        f"# {take.case}: values at the instants",
+        f"Trial {take.trial} of the case, variant `{variant}`: {table.time_utc.nunique():,} "
+        f"instants. {table.channel.nunique()} of {n_channel} channels ever have a value; "
+        f"{n_shown} have a lane{some}.",
+        marks.markdown_table(head, rows),
+        "**Above**, one tab each: values in per unit with their ±σ band, which grows with age."
+        + ("" if true is None else " The grey line is the true value."),
+        "**Middle**: how many channels of each source have a value, and how old it is.",
+        "**Below**, a lane per channel: bright green is a new measurement, dark green one that "
+        "is used again, orange a forecast in its place; a gap means that no value was young "
+        "enough.",
+    ]
 
 
 def _best_metered(table: pd.DataFrame, limit: int = 4) -> list[str]:

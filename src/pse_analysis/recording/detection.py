@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pandas as pd
 import rerun as rr
 import rerun.blueprint as rrb
 
 from pse_analysis.drawing import BLUE, GREEN, ORANGE, VERMILION
-from pse_analysis.recording import stream as marks
-from pse_analysis.recording.tables import MAX_SERIES, of_trial, open_on
+from pse_analysis.recording import marks, views
+from pse_analysis.recording.take import MAX_SERIES, Take
 from pse_analysis.vocabulary import FaultKind, Flag
-
-if TYPE_CHECKING:
-    from pse_analysis.parameters import Study
 
 N_BIN = 12
 """Bars of the share found by size."""
@@ -25,43 +19,34 @@ _KEY = ["trial", "channel", "seq"]
 
 
 def detected(
-    path: str | Path,
-    case: str,
+    take: Take,
     validated: pd.DataFrame,
     channels: pd.DataFrame,
     faults: pd.DataFrame | None,
     *,
     summary_markdown: str,
-    study: Study | None = None,
-    trial: int = 0,
 ) -> None:
     """Record how well the checks did: the score, the statistic they decide by, and spikes by size.
 
     Parameters
     ----------
-    path : str or Path
-        The ``.rrd`` file to write.
-    case : str
-        Name of the case.
+    take : Take
+        Its trial is drawn; summary and bars speak of all.
     validated, channels : DataFrame
         Tables of these names.
     faults : DataFrame, optional
         Known for simulated telemetry only.
     summary_markdown : str
         The table of detection.
-    study : Study, optional
-        The plots open on its window; without it, on the whole record.
-    trial : int
-        Trial to draw; summary and bars speak of all.
     """
-    window = open_on(validated.time_utc, study)
+    window = take.window(validated.time_utc)
     known = (
         validated.iloc[:0].assign(kind="", size=0.0)
         if faults is None
         else _paired(validated, faults)
     )
     names = [str(name) for name in channels.channel][:MAX_SERIES]
-    own = of_trial(validated, trial).sort_values("time_utc", kind="stable")
+    own = take.of(validated).sort_values("time_utc", kind="stable")
     units = channels.set_index("channel").unit
     plots = []
     for name in names:
@@ -70,34 +55,30 @@ def detected(
         top = [0.0, 3.0 * float(limit.median())] if limit.notna().any() else [0.0, 1.0]
         title = f"{name.replace(':', ' ')}: surprise and threshold [{units[name]}]"
         plots.append(window.plot(marks.entity_path("decided", name), title, top, zero=True))
-    views: list[rrb.View] = []
+    charts: list[rrb.View] = []
     sizes = {name: _by_size(known[known.channel == name]) for name in names}
     sizes = {name: table for name, table in sizes.items() if len(table)}
     for name, table in sizes.items():
         legend = rrb.PlotLegend(visible=True)
         end = f"{table.index[-1]:.3g} {units[name]}"
         title = f"{name.replace(':', ' ')}: spikes by size, in {N_BIN} groups from 0 to {end}"
-        views.append(
+        charts.append(
             rrb.BarChartView(
                 origin=marks.entity_path("sizes", name), name=title, plot_legend=legend
             )
         )
-    lower: list[rrb.Container] = [rrb.Tabs(*views)] if views else []
-    blueprint = marks.panels(
-        rrb.Horizontal(
-            rrb.TextDocumentView(origin="text/scored", name="score"),
-            rrb.Vertical(rrb.Tabs(*plots), *lower),
-            column_shares=[1, 1],
-        )
+    lower: list[rrb.Container] = [rrb.Tabs(*charts)] if charts else []
+    blueprint = views.columns(
+        views.page("text/scored", "score"), rrb.Vertical(rrb.Tabs(*plots), *lower), shares=[1, 1]
     )
-    with marks.recording(path, case, blueprint) as stream:
+    with take.open(blueprint) as stream:
         for name in names:
-            kinds = known[(known.channel == name) & (known.trial == trial)].set_index("seq").kind
+            kinds = take.of(known[known.channel == name]).set_index("seq").kind
             _draw(stream, name, own[own.channel == name], kinds)
         for name, table in sizes.items():
             entity = marks.entity_path("sizes", name)
             marks.bars(stream, entity, table, {"found": GREEN, "missed": VERMILION})
-        marks.page(stream, "text/scored", _text(summary_markdown, trial, bool(sizes)))
+        marks.page(stream, "text/scored", _text(summary_markdown, take, bool(sizes)))
 
 
 def _paired(validated: pd.DataFrame, faults: pd.DataFrame) -> pd.DataFrame:
@@ -129,7 +110,7 @@ def _draw(stream: rr.RecordingStream, name: str, own: pd.DataFrame, kinds: pd.Se
     """What the checks compared, and the threshold; a dot per finding, coloured by its rightness."""
     entity = marks.entity_path("decided", name)
     decided = own[own.statistic.notna() & own.threshold.notna()]
-    line = pd.DataFrame({"threshold": decided.threshold.to_numpy()}, index=decided.time_utc)
+    line = marks.named("threshold", decided.time_utc, decided.threshold)
     marks.lines(stream, f"{entity}/2_threshold", line, [marks.BOUND], width=1.5)
     faulty = decided.seq.isin(kinds.index).to_numpy()
     flagged = (decided.flag > Flag.GOOD).to_numpy()
@@ -140,22 +121,23 @@ def _draw(stream: rr.RecordingStream, name: str, own: pd.DataFrame, kinds: pd.Se
         ("5_alarm", "false alarm", ~faulty & flagged, ORANGE, 4.0),
     ):
         some = decided[chosen]
-        frame = pd.DataFrame({label: some.statistic.to_numpy()}, index=some.time_utc)
+        frame = marks.named(label, some.time_utc, some.statistic)
         marks.dots(stream, f"{entity}/{part}", frame, [colour], size)
 
 
-def _text(summary: str, trial: int, sized: bool) -> str:
+def _text(summary: str, take: Take, sized: bool) -> list[str]:
     text = [
         summary.strip(),
         "## What is to be seen",
-        f"**Right, above**, a tab per channel, trial {trial}: the surprise of each sample, its "
-        "deviation from the last good value or from the extrapolation, and the grey threshold. "
-        "*Green* is a fault that was found, *vermilion* one that was missed, *orange* a false "
-        "alarm. A gap raises the threshold; a true step raises alarms until it is confirmed.",
+        f"**Right, above**, a tab per channel, trial {take.trial}: the surprise of each sample, "
+        "its deviation from the last good value or from the extrapolation, and the grey "
+        "threshold. *Green* is a fault that was found, *vermilion* one that was missed, *orange* "
+        "a false alarm. A gap raises the threshold; a true step raises alarms until it is "
+        "confirmed.",
     ]
     if sized:
         text.append(
             "**Right, below**, a tab per channel: injected spikes of all trials by size, found in "
             "green and missed in vermilion. Small ones hide in the load's own movement."
         )
-    return "\n\n".join(text)
+    return text

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -12,54 +10,37 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from pse_analysis.drawing import GREEN, GREY, ORANGE, REASONS, SKY, VERMILION
-from pse_analysis.recording import stream as marks
-from pse_analysis.recording.tables import MAX_LANES, MAX_SERIES, coded, of_trial, open_on
+from pse_analysis.recording import marks, views
+from pse_analysis.recording.take import MAX_LANES, MAX_SERIES, Take, coded
 from pse_analysis.vocabulary import SEVERITY, Flag, Reason, usable
-
-if TYPE_CHECKING:
-    from pse_analysis.parameters import Study
 
 GOOD, MISSED, LOST = "good", "missed", "lost"
 _QUIET = "#33403A"
 
 
 def validated(
-    path: str | Path,
-    case: str,
+    take: Take,
     validated: pd.DataFrame,
     channels: pd.DataFrame,
     *,
-    truth: pd.DataFrame | None = None,
     sample_truth: pd.DataFrame | None = None,
     faults: pd.DataFrame | None = None,
-    study: Study | None = None,
-    trial: int = 0,
 ) -> None:
     """Record what the checks found in the telemetry.
 
     Parameters
     ----------
-    path : str or Path
-        The ``.rrd`` file to write.
-    case : str
-        Name of the case; it names the recording.
+    take : Take
     validated, channels : DataFrame
         Tables of these names.
-    truth : DataFrame, optional
-        Not drawn here: a sample is compared with `sample_truth`, the value at its own time.
     sample_truth, faults : DataFrame, optional
         Known for simulated telemetry only.
-    study : Study, optional
-        The plots open on its window; without it, on the whole record.
-    trial : int
-        Trial to draw.
     """
-    del truth
-    samples = coded(of_trial(validated, trial), "channel")
+    samples = coded(take.of(validated), "channel")
     samples = samples.sort_values("time_utc", kind="stable")
-    injected = None if faults is None else of_trial(faults, trial)
-    known = None if sample_truth is None else coded(of_trial(sample_truth, trial), "channel")
-    window = open_on(samples.time_utc, study)
+    injected = None if faults is None else take.of(faults)
+    known = None if sample_truth is None else coded(take.of(sample_truth), "channel")
+    window = take.window(samples.time_utc)
     count = samples[samples.flag > Flag.GOOD].groupby("channel", observed=True).size()
     count = count.sort_values(ascending=False, kind="stable")
     shown = _lanes_shown(channels, count, injected)
@@ -78,18 +59,16 @@ def validated(
         ]
         title = f"{name.replace(':', ' ')} [{units.get(name, '')}]"
         series.append(window.plot(marks.entity_path("telemetry", name), title, own.value))
-    blueprint = marks.panels(
-        rrb.Horizontal(
-            rrb.Vertical(
-                rrb.Tabs(*series, name="samples"),
-                window.lanes("flags", "findings by channel"),
-                row_shares=[2, 3],
-            ),
-            rrb.TextDocumentView(origin="text/validated", name="what was found"),
-            column_shares=[5, 2],
-        )
+    blueprint = views.columns(
+        rrb.Vertical(
+            rrb.Tabs(*series, name="samples"),
+            window.lanes("flags", "findings by channel"),
+            row_shares=[2, 3],
+        ),
+        views.page("text/validated", "what was found"),
+        shares=[5, 2],
     )
-    with marks.recording(path, case, blueprint) as stream:
+    with take.open(blueprint) as stream:
         for name in plotted:
             own = samples[samples.channel == name]
             true = None if known is None else known[known.channel == name]
@@ -99,7 +78,7 @@ def validated(
             faulty = None if injected is None else injected[injected.channel == name]
             times, states, colours = _findings(own, faulty)
             marks.lane(stream, marks.entity_path("flags", name), times, states, colours, [GOOD])
-        text = _findings_text(case, trial, samples, len(channels), injected, len(shown))
+        text = _findings_text(take, samples, len(channels), injected, len(shown))
         marks.page(stream, "text/validated", text)
 
 
@@ -110,7 +89,7 @@ def _draw_samples(
     # The viewer draws entities in the order of their names: the truth must not hide in the dots.
     if true is not None and len(true):
         line = true.sort_values("time_utc", kind="stable")
-        frame = pd.DataFrame({"true value": line.value.to_numpy()}, index=line.time_utc)
+        frame = marks.named("true value", line.time_utc, line.value)
         marks.lines(stream, f"{entity}/2_true", frame, [marks.TRUTH], width=1.8)
     finite = own[np.isfinite(own.value)]
     good = usable(finite.flag)
@@ -119,7 +98,7 @@ def _draw_samples(
         ("3_bad", "flagged bad", ~good, VERMILION, 4.0),
     ):
         some = finite[chosen]
-        frame = pd.DataFrame({label: some.value.to_numpy()}, index=some.time_utc)
+        frame = marks.named(label, some.time_utc, some.value)
         marks.dots(stream, f"{entity}/{part}", frame, [colour], size)
 
 
@@ -183,13 +162,12 @@ def _lanes_shown(
 
 
 def _findings_text(
-    case: str,
-    trial: int,
+    take: Take,
     samples: pd.DataFrame,
     n_channel: int,
     injected: pd.DataFrame | None,
     n_shown: int,
-) -> str:
+) -> list[str]:
     bits = samples.reasons.to_numpy()
     rows = []
     for reason in REASONS:
@@ -199,10 +177,9 @@ def _findings_text(
     flags = [(flag.name.lower(), f"{int((samples.flag == flag).sum()):,}") for flag in Flag]
     some = " (those with findings)" if n_shown < n_channel else ""
     text = [
-        f"# {case}: telemetry after the checks",
-        f"Trial {trial} of the case, history before the study included: {len(samples):,} samples "
-        f"of {n_channel} channels. "
-        f"{n_shown} channels have a lane{some}.",
+        f"# {take.case}: telemetry after the checks",
+        f"Trial {take.trial} of the case, history before the study included: {len(samples):,} "
+        f"samples of {n_channel} channels. {n_shown} channels have a lane{some}.",
         marks.markdown_table(("flag", "samples"), flags),
         marks.markdown_table(("reason", "samples", "channels"), rows)
         if rows
@@ -223,4 +200,4 @@ def _findings_text(
                     "usable samples, large vermilion dots were flagged bad.")  # fmt: skip
         text.append("**Below**, a lane per channel, coloured where a check found something. "
                     "There is no record of true faults to compare with.")  # fmt: skip
-    return "\n\n".join(text)
+    return text
