@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.validation import adaptive
+from pse_analysis.validation import forecasts
 from pse_analysis.validation.adaptive import AdaptiveParams, AdaptiveState, screen, step
 
 SEED = 22
@@ -32,10 +32,8 @@ def test_one_at_a_time_is_the_same_as_in_bulk(kind: str):
         state = AdaptiveState.empty(1, params)
         for k, row in enumerate(z[:, [column]]):
             state, one = step(state, row, sigma[k, :1], np.isfinite(row), params)
-            for name in ("flagged", "released", "value", "sigma", "statistic", "threshold"):
-                np.testing.assert_array_equal(
-                    getattr(one, name)[0], getattr(whole, name)[k, column]
-                )
+            for name, alone in one._asdict().items():
+                np.testing.assert_allclose(alone[0], getattr(whole, name)[k, column], rtol=1e-12)
 
 
 def test_printed_threshold_is_the_textbook_expression():
@@ -212,14 +210,10 @@ def test_a_channel_without_a_sample_keeps_its_past():
     after, decision = step(state, np.array([9.9]), sigma, np.zeros(1, dtype=bool), params)
     assert not decision.flagged.any()
     # Only the step itself is counted: nothing was learnt from it.
-    *before, newest = after.residuals.recent
-    assert np.isinf(newest).all()
-    np.testing.assert_array_equal(before, state.residuals.recent)
-    same(without_recent(state), without_recent(after))
-
-
-def without_recent(state: AdaptiveState) -> AdaptiveState:
-    return state._replace(residuals=state.residuals._replace(recent=()))
+    *before, newest = after.seen
+    assert not (newest.present | newest.learns).any()
+    same(tuple(before), state.seen)
+    same(state._replace(seen=()), after._replace(seen=()))
 
 
 def same(first: tuple, second: tuple) -> None:
@@ -251,7 +245,7 @@ def test_parameters_without_meaning_are_refused(wrong: dict[str, float]):
 def test_spread_of_each_forecast_is_that_of_its_design():
     line = np.column_stack([np.ones(4), np.arange(4)])
     for weights, design, ahead in zip(
-        adaptive.AHEAD,
+        forecasts.AHEAD,
         (line, np.ones((1, 1)), np.ones((4, 1))),
         ([1.0, 4.0], [1.0], [1.0]),
         strict=True,
@@ -265,8 +259,8 @@ def test_spread_of_each_forecast_is_that_of_its_design():
 def test_forecasts_are_those_of_their_weights():
     past = np.random.default_rng(SEED).normal(size=(6, 50))
     z = np.arange(50.0)
-    found = adaptive._deviations(past, z)
-    np.testing.assert_allclose(z - found, adaptive.AHEAD @ past[-4:], rtol=1e-12, atol=1e-12)
+    found = forecasts.deviations(past, z)
+    np.testing.assert_allclose(z - found, forecasts.AHEAD @ past[-4:], rtol=1e-12, atol=1e-12)
 
 
 def test_threshold_is_the_formula_of_the_forecast_that_serves_best():

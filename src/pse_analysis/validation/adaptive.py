@@ -23,9 +23,11 @@ flagged samples that agree with each other becomes the window, and one of twice 
 they agree or not. What is flagged is not learnt from, unless the next sample deviates to the same
 side: then the channel moved. Nor is anything flagged where more than three in four channels of a
 kind deviate to one side at once, by half their thresholds at least: errors are independent, and it
-is the grid that moved.
+is the grid that moved, and with it their windows.
 
-A step is a function of a state and one sample per channel; many at once are the same steps.
+A step is a function of a state and one sample per channel; many at once are the same steps. What
+matters only in the long run, the scale of each channel and the forecast that serves it, is worked
+out for some steps at once.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ import numpy.typing as npt
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.validation import tails, windows
+from pse_analysis.validation.forecasts import SPAN, Choice
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -45,22 +48,11 @@ BoolArray = npt.NDArray[np.bool_]
 
 Threshold = Literal["literal", "absolute", "scaled"]
 
-SPAN = 4
-"""Values that a local forecast rests on."""
-AHEAD = np.array([[-0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 0.0, 1.0], [0.25, 0.25, 0.25, 0.25]])
-"""Weights of the last four values in the next one: on their line, as the last one, as their mean.
-
-√(1 + Σ w²) is √(1 + x'(X'X)⁻¹x) of the designs. (3, SPAN)
-"""
-GROWTH = np.sqrt(1.0 + (AHEAD**2).sum(axis=1))
-"""σ of a forecast's residual over that of a sample. (3,)"""
 COMMON = 0.75
 """Share of a kind beyond which it is the grid that moved.
 
 One in ten samples being bad, half of five channels would err to one side once a day.
 """
-RATE = 1 / 20
-"""Weight of the newest residual in how well each forecast served."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +93,26 @@ class AdaptiveParams:
             raise ParameterError(f"adaptive: expected release > {SPAN}, received {self.release}")
 
 
+class Seen(NamedTuple):
+    """A step of which the long run is still to be told.
+
+    Attributes
+    ----------
+    past : (L, m) ndarray
+        Values before it.
+    z, size : (m,) ndarray
+        Samples, and their |r|.
+    present, learns : (m,) ndarray of bool
+        Where there was one, and where |r| is one to learn from.
+    """
+
+    past: FloatArray
+    z: FloatArray
+    size: FloatArray
+    present: BoolArray
+    learns: BoolArray
+
+
 class AdaptiveState(NamedTuple):
     """The past of m channels; rows run from old to new, NaN where there is none yet.
 
@@ -108,10 +120,12 @@ class AdaptiveState(NamedTuple):
     ----------
     values : (L, m) ndarray
         Accepted and replaced values.
-    scores : (3, m) ndarray
-        Mean |r| of every forecast of late.
+    choice : Choice
+        The forecast that served each channel best.
     residuals : Residuals
         |r| that were learnt, and the scales that they tell.
+    seen : tuple of Seen
+        Steps of which these two do not know yet.
     suspects : (release + 1, m) ndarray
         Raw values of the present run of flagged samples.
     deviation : (m,) ndarray
@@ -121,8 +135,9 @@ class AdaptiveState(NamedTuple):
     """
 
     values: FloatArray
-    scores: FloatArray
+    choice: Choice
     residuals: tails.Residuals
+    seen: tuple[Seen, ...]
     suspects: FloatArray
     deviation: FloatArray
     run: IntArray
@@ -133,8 +148,9 @@ class AdaptiveState(NamedTuple):
         """State of m channels of which nothing is known."""
         return cls(
             np.full((max(params.window - 1, SPAN), m), np.nan),
-            np.zeros((len(AHEAD), m)),
+            Choice.of(np.zeros((3, m))),
             tails.Residuals.empty(m),
+            (),
             np.full((params.release + 1, m), np.nan),
             np.zeros(m),
             np.zeros(m, dtype=np.int64),
@@ -194,11 +210,9 @@ def step(
     decision : Decision
     """
     z_near = windows.near(z, state.values[-1], turn)
-    deviations = _deviations(state.values, z_near)
-    served = state.scores.argmin(axis=0)
-    deviation = deviations[served, np.arange(len(z))]
+    deviation = z_near - state.choice.forecast(state.values)
     residual = np.abs(deviation)
-    noise = GROWTH.take(served) * sigma
+    noise = state.choice.growth * sigma
     if params.threshold == "scaled":
         # NaN, which flags nothing, as long as a channel has no scale yet.
         statistic, threshold = residual, params.factor * np.maximum(noise, state.residuals.scale)
@@ -206,26 +220,20 @@ def step(
         statistic, threshold = _printed(state.values, z_near, sigma, params)
     suspicious = present & (statistic > threshold)
     found = bool(suspicious.any())
+    past = state.values
     if found and kind is not None and params.threshold == "scaled":
-        suspicious &= ~_together(
-            present & (residual > 0.5 * threshold), deviation > 0, present, kind
-        )
+        off = present & (residual > 0.5 * threshold)
+        moved = _together(off, deviation > 0, present, kind)
+        past = np.where(moved, past + deviation, past)
+        suspicious &= ~moved
         found = bool(suspicious.any())
-
-    known = present & np.isfinite(residual)
-    scores = np.abs(deviations, out=deviations)
-    scores -= state.scores
-    scores *= RATE
-    scores += state.scores
-    if not known.all():
-        scores = np.where(known, scores, state.scores)
-    newest = np.where(known, residual, np.inf)
-    values = windows.pushed(state.values, z_near, present)
+    seen = Seen(state.values, z_near, residual, present, present)
+    values = windows.pushed(past, z_near, present)
     if not found:
         decision = Decision(suspicious, suspicious, z, sigma, statistic, threshold)
         run = np.where(present, 0, state.run) if state.run.any() else state.run
-        learnt = state.residuals.with_newest(newest, params.factor)
-        return state._replace(values=values, scores=scores, residuals=learnt, run=run), decision
+        following = state._replace(values=values, seen=(*state.seen, seen), run=run)
+        return _renewed(following, params.factor), decision
 
     suspects = windows.pushed(state.suspects, z_near, suspicious)
     run = np.where(suspicious, state.run + 1, np.where(present, 0, state.run))
@@ -236,14 +244,19 @@ def step(
     flagged = suspicious & ~released
     replacement, wide = _replacement(state.values, z_near, sigma, params)
     values[-1, flagged] = replacement[flagged]
+    size, learns = _moved(state, z_near, deviation, suspicious, run)
+    waiting = (*state.seen, seen._replace(size=size, learns=present & learns))
+    choice = state.choice
     if released.any():
         values[:, released] = suspects[-len(values) :, released]
-        scores[:, released] = _tried(suspects[:, released])
-    size, learns = _moved(state, z_near, deviation, suspicious, run)
+        # What was seen of them before tells no more how well a forecast serves.
+        waiting = tuple(step._replace(present=step.present & ~released) for step in waiting)
+        choice = choice.begun_again(released, suspects)
     following = AdaptiveState(
         values,
-        scores,
-        state.residuals.with_newest(np.where(known & learns, size, np.inf), params.factor),
+        choice,
+        state.residuals,
+        waiting,
         suspects,
         np.where(suspicious, deviation, state.deviation),
         np.where(released, 0, run),
@@ -257,7 +270,7 @@ def step(
         statistic,
         threshold,
     )
-    return following, decision
+    return _renewed(following, params.factor), decision
 
 
 def screen(
@@ -354,17 +367,14 @@ def _moved(
     return np.where(moved, size, residual), moved | ~suspicious
 
 
-def _deviations(values: FloatArray, z: FloatArray) -> FloatArray:
-    """What is left of z beyond every forecast of `AHEAD`, one small sum after the other. (3, m)"""
-    first, second, third, last = values[-SPAN:]
-    out = np.empty((len(AHEAD), len(z)))
-    np.subtract(z, last, out=out[1])
-    np.subtract(out[1], 0.5 * (third - first), out=out[0])
-    np.subtract(z, 0.25 * ((first + second) + (third + last)), out=out[2])
-    return out
-
-
-def _tried(suspects: FloatArray) -> FloatArray:
-    """Mean |r| of every forecast along a run of values."""
-    ahead = [np.abs(_deviations(suspects[:k], suspects[k])) for k in range(SPAN, len(suspects))]
-    return np.asarray(np.mean(ahead, axis=0))
+def _renewed(state: AdaptiveState, factor: float) -> AdaptiveState:
+    """The state that knows of the steps it has seen, once there are enough of them."""
+    if len(state.seen) < state.residuals.patience:
+        return state
+    past, z, size, present, learns = (np.array(part) for part in zip(*state.seen, strict=True))
+    learnt = np.where(learns & np.isfinite(size), size, np.inf)
+    return state._replace(
+        choice=state.choice.told(past, z, present),
+        residuals=state.residuals.written(learnt.T, factor),
+        seen=(),
+    )

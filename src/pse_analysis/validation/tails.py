@@ -35,17 +35,12 @@ less: so few residuals hardly move them.
 
 
 class Residuals(NamedTuple):
-    """What m channels have left of |r|, and their scales; steps add to it.
-
-    They are written down, and scales taken again, at the same steps for all channels: the large
-    array is then copied once for all of them, and the other steps hand it on.
+    """What m channels have left of |r|, and their scales.
 
     Attributes
     ----------
-    recent : tuple of (m,) ndarray
-        |r| of the steps since they were last written down; inf where nothing was learnt.
     kept : (m, MEMORY) ndarray
-        Those before, the newest written over the oldest; inf where there is none yet.
+        The last |r| of each, the newest written over the oldest; inf where there is none yet.
     steps : int
         How many steps were written down.
     learnt, judged : (m,) ndarray of int
@@ -54,7 +49,6 @@ class Residuals(NamedTuple):
         By body and tail; NaN before a channel had `RENEWAL` residuals.
     """
 
-    recent: tuple[FloatArray, ...]
     kept: FloatArray
     steps: int
     learnt: IntArray
@@ -65,28 +59,30 @@ class Residuals(NamedTuple):
     def empty(cls, m: int) -> Residuals:
         """Of m channels of which nothing is known."""
         none = np.zeros(m, dtype=np.int64)
-        return cls((), np.full((m, MEMORY), np.inf), 0, none, none, np.full(m, np.nan))
+        return cls(np.full((m, MEMORY), np.inf), 0, none, none, np.full(m, np.nan))
 
-    def with_newest(self, newest: FloatArray, factor: float) -> Residuals:
-        """With the |r| of one more step, inf where none is learnt; a threshold is c scales."""
-        recent = (*self.recent, newest)
-        if len(recent) < max(RENEWAL, min(self.steps, MEMORY) // SHARE):
-            return self._replace(recent=recent)
-        steps = self.steps + len(recent)
-        rows = np.array(recent).T
+    @property
+    def patience(self) -> int:
+        """Steps that may wait to be written down.
+
+        The large array is copied then, so all channels are written at the same steps.
+        """
+        return max(RENEWAL, min(self.steps, MEMORY) // SHARE)
+
+    def written(self, rows: FloatArray, factor: float) -> Residuals:
+        """With |r| of k more steps (m, k), inf where none is learnt; a threshold is c scales."""
         new = np.isfinite(rows)
         at, step = np.nonzero(new)
         number = self.learnt[:, None] + np.cumsum(new, axis=1)
         kept = self.kept.copy()
         kept[at, (number[at, step] - 1) % MEMORY] = rows[at, step]
-        learnt = number[:, -1]
-        due = np.flatnonzero(learnt - self.judged >= RENEWAL)
-        if not len(due):
-            return self._replace(recent=(), kept=kept, steps=steps, learnt=learnt)
+        steps, learnt = self.steps + rows.shape[1], number[:, -1]
         judged, taken = self.judged.copy(), self.scale.copy()
-        judged[due] = learnt[due]
-        taken[due] = scale(kept[due], np.minimum(learnt[due], MEMORY), factor)
-        return Residuals((), kept, steps, learnt, judged, taken)
+        due = np.flatnonzero(learnt - judged >= RENEWAL)
+        if len(due):
+            judged[due] = learnt[due]
+            taken[due] = scale(kept[due], np.minimum(learnt[due], MEMORY), factor)
+        return Residuals(kept, steps, learnt, judged, taken)
 
 
 def scale(residuals: FloatArray, count: IntArray, factor: float) -> FloatArray:
