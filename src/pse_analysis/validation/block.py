@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.validation.motion import Motion
-from pse_analysis.validation.walk import CHUNK_SAMPLES, Chunk, Walk
+from pse_analysis.validation.sieve import Chunk
+from pse_analysis.validation.walk import Walk
 from pse_analysis.vocabulary import SEVERITY, Flag, Reason
 
 Array = npt.NDArray[np.float64]
@@ -17,6 +18,9 @@ RULED_OUT = np.int32(
     sum(int(reason) for reason, level in SEVERITY.items() if level in (Flag.BAD, Flag.MISSING))
 )
 """Reasons after which a sample is no reference for those that follow."""
+
+CHUNK_SAMPLES = 1 << 20
+"""Samples worked on at once; what bounds the memory beside the results."""
 
 _LARGEST = np.finfo(float).max
 

@@ -1,18 +1,11 @@
 """Follow many channels through time: each sample against what the last good ones predict.
 
-One kernel serves the first-increment and the extrapolation check, on a block of (time × channel)
-samples. Almost all samples are ordinary: their two predecessors are good, one period apart, and
-their statistic lies inside its threshold. These are decided by whole-array operations. The rest
-(around a spike, a gap, a step) are walked sample by sample, all channels in lockstep, until the
-channel is ordinary again.
-
-Notes
------
-Eqs. (1), (12), (14) of [anishchenko2018] with k₀ = 1, referred to the last *good* samples, so that
-the good sample after a spike is not flagged with it. With v(n) the variance of the increment over n
-periods, the increment D over g periods that ends at the reference predicts the one over the m
-periods that follow as K·D, with K = [v(m+g) − v(m) − v(g)] / 2v(g) and error variance
-v(m) − K²·v(g). At m = g = 1 these are K = ρ₁ and σ²(1 − ρ₁²).
+One kernel serves the first-increment check, eq. (1) of [anishchenko2018], and the extrapolation
+check, `pse_analysis.validation.prediction`, on a block of (time × channel) samples. Almost all
+samples are ordinary: their two predecessors are good, one period apart, and their statistic lies
+inside its threshold. A sieve (`pse_analysis.validation.sieve`) finds those. The rest (around a
+spike, a gap, a step) are walked sample by sample, all channels in lockstep, until the channel is
+ordinary again.
 """
 
 from __future__ import annotations
@@ -24,46 +17,17 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.validation.motion import SNAP, Motion, shortest
+from pse_analysis.validation.motion import SNAP, Motion
+from pse_analysis.validation.prediction import Prediction
+from pse_analysis.validation.sieve import Chunk, Sieve
 from pse_analysis.vocabulary import Reason
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
-CHUNK_SAMPLES = 1 << 20
-"""Samples worked on at once; what bounds the memory beside the results."""
-
-_CACHED_SAMPLES = 1 << 15
 _NOWHERE = -9.0
 _Scalar = TypeVar("_Scalar", bound=np.generic)
-
-
-@dataclass(frozen=True, eq=False)
-class Chunk:
-    """Rows of a block, and where their findings go.
-
-    Attributes
-    ----------
-    value : (n, n_channel)
-        Samples; NaN where another check has ruled them out. [unit]
-    time : (n, 1) or (n, n_channel)
-        Time stamps in periods.
-    reasons, statistic, threshold : (n, n_channel)
-        Written in place; the last two may be None.
-    scale : (n, 1) or (n, n_channel) or None
-        Factor on σ at each sample, for a σ that follows the time of day.
-    backward : (n, 1) or (n, n_channel) or None
-        Samples that are older than one before them: checked, but never a reference.
-    """
-
-    value: Array
-    time: Array
-    reasons: npt.NDArray[np.int32]
-    statistic: Array | None = None
-    threshold: Array | None = None
-    scale: Array | None = None
-    backward: Bools | None = None
 
 
 class _At(enum.IntEnum):
@@ -113,118 +77,43 @@ class Walk:
     n_row: Ints | None = None
     _state: Array = field(init=False)
     _row: int = field(init=False, default=0)
-    _last_time: Array | None = field(init=False, default=None)
     _whole: bool = field(init=False, default=True)
-    _scratch: tuple[Array, Bools] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         motion = self.motion
         self._state = _unknown(len(motion.k))
+        self._sieve = Sieve(motion)
+        self._prediction = Prediction(motion)
         self._extrapolates = np.isfinite(motion.extrapolation)
-        self._both = self._extrapolates & np.isfinite(motion.increment)
-        self._gamma = np.where(
-            self._extrapolates, motion.extrapolation_threshold, motion.increment_threshold
-        )
-        self._k = np.where(self._extrapolates, motion.k, 0.0)
-        agreement = np.minimum(motion.increment, motion.extrapolation)
         self._limits = np.column_stack(
             [
                 motion.increment,
                 motion.extrapolation,
-                self._k,
+                np.where(self._extrapolates, motion.k, 0.0),
                 motion.one_step_variance,
-                agreement,
+                np.minimum(motion.increment, motion.extrapolation),
                 motion.confirm,
             ]
         )
-        self._turns = bool(np.isfinite(motion.turn).any())
-        # v(n) and its slope to the right of each lag; past the last one it never falls.
-        self._n_lag = motion.structure.shape[1] - 1
-        self._v = np.ascontiguousarray(motion.structure).ravel()
-        rise = np.diff(motion.structure, axis=1)
-        self._rise = np.hstack([rise, np.maximum(rise[:, -1:], 0.0)]).ravel()
 
     def samples(self, n: int) -> Array:
         """Buffer for the samples of the next chunk, (n, n_channel), NaN where ruled out."""
-        return self._work(n)[0][2:]
-
-    def _work(self, n: int) -> tuple[Array, Bools]:
-        # Fresh arrays of this size would cost a page fault every 512 samples.
-        if self._scratch is None or len(self._scratch[1]) < n:
-            width = len(self.motion.k)
-            self._scratch = (np.empty((n + 2, width)), np.empty((n, width), dtype=bool))
-        extended, fine = self._scratch
-        return extended[: n + 2], fine[:n]
+        return self._sieve.samples(n)[2:]
 
     def step(self, chunk: Chunk) -> None:
         """Advance over a chunk, whose values stand in `samples`, and write what is found."""
         n, n_channel = chunk.value.shape
         if not n or not n_channel:
             return
-        extended = self._work(n)[0]
         # Two rows of halo carry the references of ordinary channels into this chunk.
         ordinary = _ordinary(self._state, self._row)
-        value, lead = self._state[:, _At.VALUE], self._state[:, _At.LEAD]
-        extended[1] = np.where(ordinary, value, np.nan)
-        extended[0] = np.where(ordinary, value - lead, np.nan)
+        value, lead = (
+            np.where(ordinary, self._state[:, column], np.nan) for column in (_At.VALUE, _At.LEAD)
+        )
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            fine = self._sieve(chunk, extended, np.where(ordinary, lead, np.nan))
-            self._mark_uneven(fine, chunk.time)
-            self._walk(fine, extended, chunk)
+            fine = self._sieve.fine(chunk, value, lead)
+            self._walk(fine, self._sieve.samples(n), chunk)
         self._row += n
-        self._last_time = np.array(chunk.time[-1:], copy=True)
-
-    def _sieve(self, chunk: Chunk, extended: Array, lead: Array) -> Bools:
-        """Which samples are inside their threshold if all before them are ordinary."""
-        n, n_channel = chunk.value.shape
-        fine = self._work(n)[1]
-        second = None
-        if self._both.any():
-            second = np.where(self._both, self.motion.increment_threshold, np.inf)
-        turning = np.flatnonzero(np.isfinite(self.motion.turn))
-        # Slabs that stay in the processor's cache: the arithmetic is nothing beside the traffic.
-        slab = max(1, _CACHED_SAMPLES // n_channel)
-        change = np.empty((min(slab, n) + 1, n_channel))
-        scores = np.empty((min(slab, n), n_channel))
-        for start in range(0, n, slab):
-            rows = slice(start, min(start + slab, n))
-            size = rows.stop - rows.start
-            moved, score = change[: size + 1], scores[:size]
-            if chunk.statistic is not None:
-                score = chunk.statistic[rows]
-            scale = None if chunk.scale is None else chunk.scale[rows]
-            limit = self._gamma[None, :] if scale is None else self._gamma * scale
-            np.subtract(
-                extended[start + 1 : rows.stop + 2], extended[start : rows.stop + 1], out=moved
-            )
-            if start == 0:
-                moved[0] = lead
-            for lane in turning:
-                moved[:, lane] = shortest(moved[:, lane], self.motion.turn[lane])
-            # With k = 0 this still spreads a NaN behind, so that "ordinary" means one thing.
-            np.multiply(moved[:-1], self._k, out=score)
-            np.subtract(moved[1:], score, out=score)
-            np.abs(score, out=score)
-            np.less_equal(score, limit, out=fine[rows])
-            if second is not None:
-                naive = np.abs(moved[1:], out=moved[1:])
-                # NaN has been dealt with above; here it must not count as exceeding.
-                fine[rows] &= ~(naive > (second if scale is None else second * scale))
-            if chunk.threshold is not None:
-                chunk.threshold[rows] = limit
-        return fine
-
-    def _mark_uneven(self, fine: Bools, time: Array) -> None:
-        """Take out the samples that do not come one period after the row before."""
-        before = self._last_time
-        if before is None:
-            before = np.full((1, time.shape[1]), np.nan)
-        elapsed = np.diff(np.vstack([before, time]), axis=0)
-        uneven = ~(np.abs(elapsed - 1.0) <= SNAP)
-        if time.shape[1] == 1:
-            fine[np.flatnonzero(uneven[:, 0])] = False
-        else:
-            fine[uneven] = False
 
     def _walk(self, fine: Bools, extended: Array, chunk: Chunk) -> None:
         """Walk every channel from each sample that is not fine until it is ordinary again."""
@@ -263,7 +152,9 @@ class Walk:
             return
         state = np.empty((len(lane), len(_At)))
         state[:, _At.VALUE] = extended[row + 1, lane]
-        state[:, _At.LEAD] = self._shortest(lane, state[:, _At.VALUE] - extended[row, lane])
+        state[:, _At.LEAD] = self._prediction.shortest(
+            lane, state[:, _At.VALUE] - extended[row, lane]
+        )
         state[:, _At.TIME] = _at(time, row - 1, lane)
         state[:, _At.ROW] = row - 1 + self._row
         state[:, _At.LEAD_ROW] = row - 2 + self._row
@@ -286,10 +177,12 @@ class Walk:
         increment, extrapolation, k, floor, agreement, confirm = self._limits[lane].T
 
         reference = state[:, _At.VALUE]
-        change = self._shortest(lane, x - reference)
+        change = self._prediction.shortest(lane, x - reference)
         elapsed = np.abs(t - state[:, _At.TIME])
         elapsed = elapsed if whole else _snapped(elapsed)
-        predicted, error, variance = self._extrapolate(lane, state, elapsed, k, floor, older)
+        predicted, error, variance = self._prediction.extrapolate(
+            lane, state[:, _At.LEAD], state[:, _At.SPAN], elapsed, k, floor, older
+        )
         moved = np.abs(change)
         surprise = np.abs(change - predicted)
         # A check that is not made has no finite threshold, and NaN is exceeded by nothing: neither
@@ -357,10 +250,12 @@ class Walk:
         now, when = x[which], t[which]
         waited = np.abs(when - state[which, _At.STEP_TIME])
         waited = waited if whole else _snapped(waited)
-        near = agreement[which] * np.sqrt(self._variance(lane[which], waited, floor[which]))
+        near = agreement[which] * np.sqrt(
+            self._prediction.variance(lane[which], waited, floor[which])
+        )
         if factor is not None:
             near = near * factor[which]
-        led = self._shortest(lane[which], now - state[which, _At.STEP_VALUE])
+        led = self._prediction.shortest(lane[which], now - state[which, _At.STEP_VALUE])
         before = state[which, _At.COUNT]
         agrees = (before >= 0.0) & (np.abs(led) <= near)
         count = np.where(agrees, before + 1.0, 0.0)
@@ -372,51 +267,6 @@ class Walk:
         state[which, _At.LEAD] = np.where(enough, led, state[which, _At.LEAD])
         state[which, _At.SPAN] = np.where(enough, waited, state[which, _At.SPAN])
         return accepted
-
-    def _shortest(self, lane: Ints, change: Array) -> Array:
-        return shortest(change, self.motion.turn[lane]) if self._turns else change
-
-    def _variance(self, lane: Ints, periods: Array, floor: Array) -> Array:
-        """v(n) at real n ≥ 1, linear between whole lags and beyond the last; (n,) [unit²]."""
-        n = np.fmax(periods, 1.0)
-        low = np.minimum(n, self._n_lag).astype(np.int64)
-        index = lane * (self._n_lag + 1) + low
-        v = self._v[index] + (n - low) * self._rise[index]
-        # Estimated v(n) may dip; over a gap nothing becomes more certain than over one period.
-        return np.asarray(np.maximum(v, floor))
-
-    def _extrapolate(
-        self,
-        lane: Ints,
-        state: Array,
-        elapsed: Array,
-        k_one: Array,
-        floor: Array,
-        older: Bools | None,
-    ) -> tuple[Array | float, Array, Array]:
-        """Predicted change since the reference, the variance of its error, and v(elapsed)."""
-        lead, span = state[:, _At.LEAD], state[:, _At.SPAN]
-        usable = (k_one != 0.0) & (lead == lead)
-        if older is not None:
-            usable &= ~older
-        if not usable.any():
-            variance = self._variance(lane, elapsed, floor)
-            return 0.0, variance, variance
-        n = len(lane)
-        three = self._variance(
-            np.concatenate([lane, lane, lane]),
-            np.concatenate([elapsed, span, elapsed + span]),
-            np.concatenate([floor, floor, floor]),
-        )
-        variance, v_span, v_both = three[:n], three[n : 2 * n], three[2 * n :]
-        # v(span) is 0 only where nothing ever changes; k is then of no account.
-        k = 0.5 * (v_both - variance - v_span) / np.where(v_span > 0.0, v_span, np.inf)
-        one = (elapsed == 1.0) & (span == 1.0)
-        k = np.where(one, k_one, k)
-        error = np.where(one, floor, np.maximum(variance - k * k * v_span, floor))
-        # Within less than a period only part of the predicted change can have happened.
-        predicted = k * lead * np.minimum(elapsed, 1.0)
-        return np.where(usable, predicted, 0.0), np.where(usable, error, variance), variance
 
 
 def _at(table: npt.NDArray[_Scalar], row: Ints, lane: Ints) -> npt.NDArray[_Scalar]:
