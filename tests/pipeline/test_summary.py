@@ -32,7 +32,7 @@ def scored() -> pd.DataFrame:
 def test_means_are_averaged_and_largest_errors_are_not(scored: pd.DataFrame) -> None:
     line = next(line for line in text("a case", scored).splitlines() if "wls" in line)
     # Thousandths of p.u., thousandths of a degree, shares; unknown metrics stay a dash.
-    assert line.split() == ["wls", "2.000", "20.00", "57.3", "–", "–", "95.0%", "–", "–", "–"]
+    assert line.split() == ["wls", "2.000", "20.00", "57.3", *"–––", "95.0%", *"–––"]
 
 
 def test_text_is_the_same_where_a_notebook_runs_it(
@@ -47,6 +47,33 @@ def test_text_fits_any_terminal_of_100_columns(scored: pd.DataFrame) -> None:
     lines = text("a case", scored).splitlines()
     assert max(map(len, lines)) <= 100
     assert not any(line.endswith(" ") for line in lines)
+
+
+def test_no_number_is_cut_off_where_filters_went_astray() -> None:
+    metrics = {
+        "vm_error_mean": (17.2, "pu"),
+        "vm_error_max": (1172.27, "pu"),
+        "va_error_mean": (0.7265, "rad"),
+        "va_error_max": (3.1414, "rad"),
+        "nis_ratio": (17227.361, ""),
+        "nees_ratio": (1.5e8, ""),
+        "coverage_vm": (1.0, ""),
+        "coverage_va": (1.0, ""),
+        "steps_not_ok": (17964.0, ""),
+        "seconds": (1632.4, "s"),
+    }
+    rows = [("improved_ukf_2", 0, m, "", value, unit) for m, (value, unit) in metrics.items()]
+    columns = ["method", "trial", "metric", "element", "value", "unit"]
+    table = text("a case", pd.DataFrame(rows, columns=columns))
+    assert "…" not in table
+    assert max(map(len, table.splitlines())) <= 100
+    line = next(line for line in table.splitlines() if "improved" in line)
+    assert line.split()[1:7] == ["17200", "1172270", "41625.4", "179989", "17227", "1.5e+08"]
+
+
+def test_units_in_brackets_are_shown(scored: pd.DataFrame) -> None:
+    assert "[s]" in text("a case [1]", scored)
+    assert "a case [1]" in text("a case [1]", scored)
 
 
 def test_bad_data_are_counted_over_trials(scored: pd.DataFrame) -> None:

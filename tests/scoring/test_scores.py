@@ -135,6 +135,7 @@ def test_truth_that_matches_no_estimate_is_refused() -> None:
 
 
 def test_consistency_by_hand() -> None:
+    """Three states have a σ at minutes 0 and 5, two at 10 and 60; the angle of bus 1 is fixed."""
     scored = consistency.of_steps(
         steps(
             [
@@ -143,12 +144,24 @@ def test_consistency_by_hand() -> None:
                 (10, "predicted", np.nan, 0, 6.0),
                 (60, "inconsistent", 8.0, 30, 8.0),
             ]
-        )
+        ),
+        estimates(
+            [
+                ("kf", minute, bus, quantity, 1.0, sigma)
+                for minute in (0, 5, 10, 60)
+                for bus, quantity, sigma in (
+                    ("bus/1", "vm_pu", 0.01 if minute < 10 else np.nan),
+                    ("bus/1", "va_degree", 0.0),
+                    ("bus/2", "vm_pu", 0.01),
+                    ("bus/2", "va_degree", 0.1),
+                )
+            ]
+        ),
     )
     assert value(scored, "nis_ratio") == pytest.approx(20 / 40)
     assert value(scored, "nis_ratio", "hour/06") == pytest.approx(1.2)
     assert value(scored, "nis_ratio", "hour/07") == pytest.approx(8 / 30)
-    assert value(scored, "nees") == pytest.approx(6.0)
+    assert value(scored, "nees_ratio") == pytest.approx((4 + 6 + 8) / (3 + 2 + 2))
     assert value(scored, "steps_not_ok") == 2
     assert value(scored, "seconds") == 1.0
 

@@ -11,9 +11,12 @@ import pandas as pd
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 WIDTH = 100
 NOTHING = "–"
+LONGEST = 7
+"""Characters of a number; one of a filter that went astray loses decimals, not its end."""
 
 
 def _mean(values: pd.Series[float]) -> float:
@@ -35,13 +38,14 @@ def _sum(values: pd.Series[float]) -> float:
 Columns: TypeAlias = "tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...]"
 
 COLUMNS: Columns = (
-    ("vm_error_mean", "|V| error\nmean", _mean, ".3f"),
-    ("vm_error_max", "|V| error\nlargest", _largest, ".2f"),
-    ("va_error_mean", "∠V error\nmean", _mean, ".1f"),
-    ("va_error_max", "∠V error\nlargest", _largest, ".0f"),
-    ("nis_ratio", "\nNIS/m", _mean, ".2f"),
-    ("coverage_vm", "|V| in\n±2σ", _mean, ".1%"),
-    ("coverage_va", "∠V in\n±2σ", _mean, ".1%"),
+    ("vm_error_mean", "|V|\nerror\nmean", _mean, ".3f"),
+    ("vm_error_max", "|V|\nerror\nlargest", _largest, ".2f"),
+    ("va_error_mean", "∠V\nerror\nmean", _mean, ".1f"),
+    ("va_error_max", "∠V\nerror\nlargest", _largest, ".0f"),
+    ("nis_ratio", "NIS/m", _mean, ".2f"),
+    ("nees_ratio", "NEES/n", _mean, ".2f"),
+    ("coverage_vm", "|V|\nin\n±2σ", _mean, ".1%"),
+    ("coverage_va", "∠V\nin\n±2σ", _mean, ".1%"),
     ("steps_not_ok", "steps\nnot ok", _sum, ".0f"),
     ("seconds", "time\n[s]", _sum, ".1f"),
 )
@@ -54,19 +58,20 @@ MACHINE_COLUMNS: Columns = (
     ("speed_rms", "ω RMS\n[mrad/s]", _rms, ".1f"),
     ("speed_rms_theory", "theory\n[mrad/s]", _mean, ".1f"),
     ("speed_settling", "settles\n[s]", _mean, ".2f"),
-    ("nis_ratio", "\nNIS/m", _mean, ".3g"),
+    ("nis_ratio", "NIS/m", _mean, ".3g"),
+    ("nees_ratio", "NEES/n", _mean, ".3g"),
     ("coverage_angle", "θ in\n±2σ", _mean, ".1%"),
     ("steps_not_ok", "steps\nnot ok", _sum, ".0f"),
 )
 
 CHECK_HEAD = (
-    "\nfaults by kind, then by channel",
-    "\ninjected",
-    "\nfound",
-    "\nrecall",
+    "faults by kind, then by channel",
+    "injected",
+    "found",
+    "recall",
     "false\nalarms",
     "per 1000\ngood",
-    "\nprecision",
+    "precision",
 )
 
 CHECKED = "What the checks found of the injected faults, all trials together"
@@ -91,12 +96,16 @@ def text(title: str, scored: pd.DataFrame) -> str:
         brought together: largest errors by their maximum, times by their sum, others by their mean.
     """
     units, head, rows = _content(scored)
-    table = Table(title=f"{_title(title, scored)}\n{units}", title_style="", box=box.SIMPLE_HEAD)
+    # As `Text`, because a unit in square brackets would be read as a style.
+    table = Table(
+        title=Text(f"{_title(title, scored)}\n{units}", justify="center"), title_style="",
+        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1),
+    )  # fmt: skip
     for heading in head:
         justify: Literal["left", "right"] = "left" if heading is head[0] else "right"
-        table.add_column(heading, justify=justify, no_wrap=True)
+        table.add_column(Text(heading), justify=justify, no_wrap=True, vertical="bottom")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     stored = io.StringIO()
     # A fixed width and no colours: the text is stored, and read again by runs of any terminal.
     # A notebook would take the text away from the file.
@@ -104,7 +113,7 @@ def text(title: str, scored: pd.DataFrame) -> str:
         file=stored, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
     )
     console.print(table)
-    console.print(detection(scored), highlight=False)
+    console.print(Text(f"\n{detection(scored)}"))
     return "\n".join(line.rstrip() for line in stored.getvalue().strip("\n").splitlines()) + "\n"
 
 
@@ -150,7 +159,7 @@ def _content(scored: pd.DataFrame) -> tuple[str, list[str], list[list[str]]]:
     if (scored["method"] == "validate").all() and len(scored):
         return CHECKED, list(CHECK_HEAD), _check_rows(scored)
     columns, units, _ = _form(scored)
-    return units, ["\nmethod", *(heading for _, heading, _, _ in columns)], _rows(scored)
+    return units, ["method", *(heading for _, heading, _, _ in columns)], _rows(scored)
 
 
 def _check_rows(scored: pd.DataFrame) -> list[list[str]]:
@@ -185,6 +194,14 @@ def _form(scored: pd.DataFrame) -> tuple[Columns, str, dict[str, float]]:
     return COLUMNS, UNITS, _SCALE
 
 
+def _short(value: float, form: str) -> str:
+    """A number in the given format, or with so few digits that it fits into a column."""
+    found = format(value, form)
+    if len(found) > LONGEST and not form.endswith("%"):
+        found = format(value, ".0f" if 1.0 <= abs(value) < 10**LONGEST else ".1e")
+    return found
+
+
 def _rows(scored: pd.DataFrame) -> list[list[str]]:
     columns, _, scales = _form(scored)
     whole = scored[(scored["element"] == "") & (scored["method"] != "validate")]
@@ -196,6 +213,6 @@ def _rows(scored: pd.DataFrame) -> list[list[str]]:
             rows = own[own["metric"] == metric]
             scale = rows["unit"].map(scales).fillna(1.0).astype(float)
             value = together(rows["value"].astype(float) * scale) if len(rows) else math.nan
-            cells.append(format(value, form) if math.isfinite(value) else NOTHING)
+            cells.append(_short(value, form) if math.isfinite(value) else NOTHING)
         found.append(cells)
     return found

@@ -97,7 +97,7 @@ def score(
         of it, and the kind of fault or the channel for detection, whose method is "validate".
     """
     params = params or ScoreParams()
-    parts = [consistency.of_steps(steps, by_hour=params.by_hour)] if len(steps) else []
+    parts = [consistency.of_steps(steps, estimated, by_hour=params.by_hour)] if len(steps) else []
     if truth is not None and len(estimated):
         paired = errors.against_truth(estimated, truth)
         parts.append(errors.of_states(paired, by_element=params.by_element))

@@ -33,21 +33,22 @@ def bounds(dof: float, confidence: float = 0.99) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def of_steps(steps: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
+def of_steps(steps: pd.DataFrame, estimated: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
     """Consistency and cost of every method and trial.
 
     Parameters
     ----------
-    steps : DataFrame
-        Table ``steps``.
+    steps, estimated : DataFrame
+        Tables of these names; from the second come the degrees of freedom of NEES, which are the
+        states that have a σ.
     by_hour : bool
         Whether to add NIS by hour of day.
 
     Returns
     -------
     DataFrame
-        Metrics ``nis_ratio`` (ΣNIS/Σm), ``nees`` (mean over steps), ``steps_not_ok`` and
-        ``seconds``.
+        Metrics ``nis_ratio`` (ΣNIS/Σm), ``nees_ratio`` (ΣNEES/Σn), ``steps_not_ok`` and
+        ``seconds``. Both ratios are 1 where the filter knows how sure it may be.
     """
     judged = steps["nis"].notna() & (steps["dof"] > 0)
     table = steps.assign(
@@ -57,10 +58,13 @@ def of_steps(steps: pd.DataFrame, *, by_hour: bool = True) -> pd.DataFrame:
         element=_hour(steps["time_utc"]),
     )
     key = ["method", "trial"]
+    free = estimated[estimated["sigma"] > 0].groupby([*key, "time_utc"], observed=True).size()
+    table = table.merge(free.rename("n").reset_index(), on=[*key, "time_utc"], how="left")
+    table["n"] = table["n"].where(table["nees"].notna())
     whole = table.groupby(key, sort=True)
     rows = [
         _long(whole["nis"].sum(min_count=1) / whole["dof"].sum(min_count=1), "nis_ratio", "1"),
-        _long(whole["nees"].mean(), "nees", "1"),
+        _long(whole["nees"].sum(min_count=1) / whole["n"].sum(min_count=1), "nees_ratio", "1"),
         _long(whole["not_ok"].sum(), "steps_not_ok", "1"),
         _long(whole["seconds"].sum(), "seconds", "s"),
     ]
