@@ -22,7 +22,7 @@ from pse_analysis.alignment.samples import MICROSECOND, Samples, first_use
 from pse_analysis.alignment.stamps import sampling_times
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import IA, VA, Model, SensorLayout, standard_deviation, wrap
+from pse_analysis.measurement import Model, SensorLayout, standard_deviation, wrap
 from pse_analysis.parameters import Study
 from pse_analysis.vocabulary import Origin, check
 
@@ -214,7 +214,7 @@ def _fuse(
         gap = (samples.time[right] - samples.time[left]) / MICROSECOND
         share = age[between] / gap
         change = samples.value[right] - samples.value[left]
-        change = np.where(np.isin(layout.quantity[place[between]], (VA, IA)), wrap(change), change)
+        change = np.where(layout.angular[place[between]], wrap(change), change)
         value[between] += share * change
         bridge = rate[samples.group[left]] * gap * share * (1 - share)
         late = np.sqrt(

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.alignment.stamps import SamplingTimes, microseconds
-from pse_analysis.measurement import IA, VA, SensorLayout, standard_deviation, wrap
+from pse_analysis.measurement import SensorLayout, standard_deviation, wrap
 from pse_analysis.vocabulary import usable
 
 FloatArray = npt.NDArray[np.float64]
@@ -186,7 +186,7 @@ class Samples:
                 continue
             place = int(self.column[rows[0]])
             value = self.value[rows]
-            if layout.quantity[place] in (VA, IA):
+            if layout.angular[place]:
                 value = value[0] + np.concatenate([[0.0], np.cumsum(wrap(np.diff(value)))])
             middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
             change = middle[APART:] - middle[:-APART]

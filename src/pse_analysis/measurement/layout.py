@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -104,90 +105,25 @@ class SensorLayout:
         TableError
             If a unit does not fit its quantity, or a side its element.
         """
-        if isinstance(model, Machine):
-            return cls._of_machine(channels, model)
-        network = model
-        names = tuple(channels["channel"])
-        m = len(names)
-        quantity, position, side = (np.zeros(m, dtype=np.int64) for _ in range(3))
-        factor = np.ones(m)
-        for i, (channel, q, element, end, unit) in enumerate(
-            zip(
-                names,
-                channels["quantity"],
-                channels["element"],
-                channels["side"],
-                channels["unit"],
-                strict=True,
-            )
-        ):
-            kind, _, name = element.partition("/")
-            quantity[i] = QUANTITIES.index(Quantity(q))
-            side[i] = _SIDES[end]
-            if (kind == "bus") != (side[i] == BUS):
-                raise TableError(
-                    f"channels: {channel!r} measures {element!r} at side {end!r}: expected '' "
-                    "for a bus, 'from' or 'to' for a branch"
-                )
-            if side[i] != BUS and quantity[i] in (VM, VA):
-                raise TableError(
-                    f"channels: {channel!r} measures {q} of a branch: voltages belong to buses"
-                )
-            if unit not in UNITS[Quantity(q)]:
-                raise TableError(
-                    f"channels: unit {unit!r} of {channel!r} does not fit {q}: expected "
-                    f"{' or '.join(UNITS[Quantity(q)])}"
-                )
-            position[i] = network.bus(name) if kind == "bus" else network.branch(name)
-            metered = metered_bus(network, position[i], side[i])
-            factor[i] = per_unit_factor(network, unit, int(metered))
+        _check_units(channels)
+        position, side, factor = (
+            _in_machine(channels, model)
+            if isinstance(model, Machine)
+            else _in_network(channels, model)
+        )
         relative = (channels["sigma_kind"] == SigmaKind.RELATIVE).to_numpy()
+        mean = (channels["aggregation"] == Aggregation.MEAN).to_numpy()
         return cls(
-            channel=names,
-            quantity=quantity,
+            channel=tuple(channels["channel"]),
+            quantity=np.array(
+                [QUANTITIES.index(Quantity(q)) for q in channels["quantity"]], dtype=np.int64
+            ),
             position=position,
             side=side,
             scale=factor * channels["sign"].to_numpy(dtype=float),
             sigma=np.where(relative, 1.0, factor) * channels["sigma"].to_numpy(dtype=float),
             relative=relative,
-            window_s=np.where(
-                channels["aggregation"] == Aggregation.MEAN,
-                channels["period_s"].to_numpy(dtype=float),
-                0.0,
-            ),
-            source=tuple(channels["source"]),
-        )
-
-    @classmethod
-    def _of_machine(cls, channels: pd.DataFrame, machine: Machine) -> SensorLayout:
-        m = len(channels)
-        foreign = channels[channels["element"] != machine.element]
-        if len(foreign):
-            raise TableError(
-                f"channels: {foreign['channel'].iloc[0]!r} stands at "
-                f"{foreign['element'].iloc[0]!r}: expected {machine.element!r}"
-            )
-        for channel, q, unit in zip(
-            *(channels[c] for c in ("channel", "quantity", "unit")), strict=True
-        ):
-            if unit not in UNITS[Quantity(q)]:
-                raise TableError(
-                    f"channels: unit {unit!r} of {channel!r} does not fit {q}: expected "
-                    f"{' or '.join(UNITS[Quantity(q)])}"
-                )
-        return cls(
-            channel=tuple(channels["channel"]),
-            quantity=np.array([QUANTITIES.index(Quantity(q)) for q in channels["quantity"]]),
-            position=np.zeros(m, dtype=np.int64),
-            side=np.full(m, BUS, dtype=np.int64),
-            scale=channels["sign"].to_numpy(dtype=float),
-            sigma=channels["sigma"].to_numpy(dtype=float),
-            relative=(channels["sigma_kind"] == SigmaKind.RELATIVE).to_numpy(),
-            window_s=np.where(
-                channels["aggregation"] == Aggregation.MEAN,
-                channels["period_s"].to_numpy(dtype=float),
-                0.0,
-            ),
+            window_s=np.where(mean, channels["period_s"].to_numpy(dtype=float), 0.0),
             source=tuple(channels["source"]),
         )
 
@@ -234,10 +170,60 @@ class SensorLayout:
             columns[name] = tuple(map(str, columns[name]))
         return SensorLayout(**columns)
 
+    @cached_property
+    def angular(self) -> npt.NDArray[np.bool_]:
+        """Rows that are angles of voltages or currents, whose differences must be folded. (m,)"""
+        return np.isin(self.quantity, (VA, IA))
+
     @property
     def has_angle(self) -> bool:
         """Whether any row fixes the angle against an outside reference."""
-        return bool(np.isin(self.quantity, (VA, IA)).any())
+        return bool(self.angular.any())
+
+
+def _check_units(channels: pd.DataFrame) -> None:
+    for channel, q, unit in zip(
+        *(channels[c] for c in ("channel", "quantity", "unit")), strict=True
+    ):
+        if unit not in UNITS[Quantity(q)]:
+            raise TableError(
+                f"channels: unit {unit!r} of {channel!r} does not fit {q}: expected "
+                f"{' or '.join(UNITS[Quantity(q)])}"
+            )
+
+
+def _in_network(channels: pd.DataFrame, network: Network) -> tuple[IntArray, IntArray, FloatArray]:
+    """Position, side and per-unit factor of every channel of a grid."""
+    position, side = (np.zeros(len(channels), dtype=np.int64) for _ in range(2))
+    factor = np.ones(len(channels))
+    columns = (channels[c] for c in ("channel", "quantity", "element", "side", "unit"))
+    for i, (channel, q, element, end, unit) in enumerate(zip(*columns, strict=True)):
+        kind, _, name = element.partition("/")
+        side[i] = _SIDES[end]
+        if (kind == "bus") != (side[i] == BUS):
+            raise TableError(
+                f"channels: {channel!r} measures {element!r} at side {end!r}: expected '' "
+                "for a bus, 'from' or 'to' for a branch"
+            )
+        if side[i] != BUS and QUANTITIES.index(Quantity(q)) in (VM, VA):
+            raise TableError(
+                f"channels: {channel!r} measures {q} of a branch: voltages belong to buses"
+            )
+        position[i] = network.bus(name) if kind == "bus" else network.branch(name)
+        factor[i] = per_unit_factor(network, unit, int(metered_bus(network, position[i], side[i])))
+    return position, side, factor
+
+
+def _in_machine(channels: pd.DataFrame, machine: Machine) -> tuple[IntArray, IntArray, FloatArray]:
+    """The same of a machine, which has one place and its units in p.u. and rad."""
+    foreign = channels[channels["element"] != machine.element]
+    if len(foreign):
+        raise TableError(
+            f"channels: {foreign['channel'].iloc[0]!r} stands at "
+            f"{foreign['element'].iloc[0]!r}: expected {machine.element!r}"
+        )
+    m = len(channels)
+    return np.zeros(m, dtype=np.int64), np.full(m, BUS, dtype=np.int64), np.ones(m)
 
 
 def per_unit_factor(network: Network, unit: str, bus: int) -> float:

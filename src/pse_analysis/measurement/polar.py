@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -184,10 +182,10 @@ class MeasurementModel:
         """∂h/∂x at one state, (m, n): rows follow the layout, columns ``columns``."""
         return self.matrix(self.jacobian_data(x))
 
-    @cached_property
+    @property
     def angular(self) -> npt.NDArray[np.bool_]:
         """Rows that are angles, whose differences must be folded. (m,)"""
-        return np.isin(self.layout.quantity, (VA, IA))
+        return self.layout.angular
 
     def residual(self, z: FloatArray, x: FloatArray) -> FloatArray:
         """Residual z - h(x) with angle differences folded into [-π, π). (m,)"""

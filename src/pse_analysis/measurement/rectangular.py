@@ -66,7 +66,7 @@ class RectangularModel:
         self.functionals = sparse.csr_array((value, (row, col)), shape=(m, n)).toarray()
         self.partner = _partners(layout)
         self._metered = np.where(quantity >= P, np.append(t.metered, 0)[t.of_row], layout.position)
-        self._angle = np.isin(quantity, (VA, IA))
+        self._angle = layout.angular
         self._size = np.isin(quantity, (VM, IM))
         self._sign = np.where(quantity == Q, -1.0, 1.0)
         self._across = np.where(np.isin(quantity, (VA, IA, Q)), 1j, 1.0)

@@ -14,9 +14,7 @@ from pse_analysis.errors import ParameterError
 from pse_analysis.grid import power_flow
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import (
-    IA,
     IM,
-    VA,
     MeasurementModel,
     P,
     Q,
@@ -205,7 +203,7 @@ def observe(
     """
     layout = SensorLayout.from_channels(table, network)
     exact = MeasurementModel(network, layout).h(truth.x)
-    angle = np.isin(layout.quantity, (VA, IA))
+    angle = layout.angular
     # An angle that passes ±π between two instants must not be averaged or interpolated to 0.
     exact[angle] = np.unwrap(exact[angle], axis=1)
     sampled, value = _sample(exact, truth.time, group)
