@@ -38,14 +38,14 @@ def _sum(values: pd.Series[float]) -> float:
 Columns: TypeAlias = "tuple[tuple[str, str, Callable[[pd.Series[float]], float], str], ...]"
 
 COLUMNS: Columns = (
-    ("vm_error_mean", "|V|\nerror\nmean", _mean, ".3f"),
-    ("vm_error_max", "|V|\nerror\nlargest", _largest, ".2f"),
-    ("va_error_mean", "∠V\nerror\nmean", _mean, ".1f"),
-    ("va_error_max", "∠V\nerror\nlargest", _largest, ".0f"),
+    ("vm_error_mean", "|V|\nmean", _mean, ".3f"),
+    ("vm_error_max", "|V|\nlargest", _largest, ".2f"),
+    ("va_error_mean", "∠V\nmean", _mean, ".1f"),
+    ("va_error_max", "∠V\nlargest", _largest, ".0f"),
     ("nis_ratio", "NIS/m", _mean, ".2f"),
     ("nees_ratio", "NEES/n", _mean, ".2f"),
-    ("coverage_vm", "|V|\nin\n±2σ", _mean, ".1%"),
-    ("coverage_va", "∠V\nin\n±2σ", _mean, ".1%"),
+    ("coverage_vm", "|V| in\n±2σ", _mean, ".1%"),
+    ("coverage_va", "∠V in\n±2σ", _mean, ".1%"),
     ("steps_not_ok", "steps\nnot ok", _sum, ".0f"),
     ("seconds", "time\n[s]", _sum, ".1f"),
 )
@@ -75,7 +75,7 @@ CHECK_HEAD = (
 )
 
 CHECKED = "What the checks found of the injected faults, all trials together"
-UNITS = "Errors of |V| in 1e-3 pu, of its angle in 1e-3 degree"
+UNITS = "Mean and largest error of |V| in 1e-3 pu, of its angle in 1e-3 degree"
 MACHINE_UNITS = "RMS error of rotor angle θ and speed ω, and when it settles into ±2σ of theory"
 
 # Errors are small: shown in thousandths, and angles of buses in degrees, as everywhere a person
