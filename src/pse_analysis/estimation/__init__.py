@@ -174,9 +174,15 @@ def _build_plain(
         step_s=study.step_s,
         reach_s=_reach(history, layout, study.step_s),
         instant=method.reading == "instant",
-        refuse=refusal.refuse() if method.screening == "innovation" else None,
+        refuse=_refuse(method) if method.screening == "innovation" else None,
         process=composition.process_of(method.compose),
     )
+
+
+def _refuse(method: Method) -> refusal.Refuse:
+    params = refusal.InnovationParams()
+    # One variance for all voltages is chosen above whatever they do; loads surprise what is learnt.
+    return refusal.refuse(replace(params, doubt=1.0) if method.noise == "scalar" else params)
 
 
 def _known_noise(

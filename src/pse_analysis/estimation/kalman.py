@@ -148,9 +148,10 @@ class KalmanFilter:
         full = np.full((2, m), np.nan)
         refused = np.zeros(m, dtype=bool)
         try:
-            innovation = innovation_of(readings, *frame.at(at))
+            turn, z, spread = frame.at(at)
+            innovation = innovation_of(readings, turn, z, spread)
             if self.refuse is not None:
-                out = self.refuse(innovation.eta, innovation.chol_S)
+                out = self.refuse(innovation.eta, innovation.chol_S, spread)
                 if out.any():
                     full[0, rows], full[1, rows] = innovation.eta, innovation.sigma
                     full[:, rows[~out]] = np.nan

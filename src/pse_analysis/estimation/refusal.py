@@ -12,15 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
+from scipy.linalg import lapack
 
 from pse_analysis.errors import ParameterError
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-Refuse = Callable[[FloatArray, FloatArray], BoolArray]
-"""(innovation (m,), lower Cholesky factor of its covariance (m, m)) -> rows not to be used (m,).
+Refuse = Callable[[FloatArray, FloatArray, FloatArray], BoolArray]
+"""(innovation (m,), lower Cholesky factor of its covariance (m, m), σ of the measurements (m,)) ->
+rows not to be used (m,).
 
 The filter has the factor already; above the diagonal it is zero.
 """
@@ -33,28 +34,40 @@ class InnovationParams:
     Attributes
     ----------
     factor : float
-        c: refused if the innovation lies more than c of its own σ, given all other channels, away
-        from what these and the forecast predict. Loads are heavy-tailed: where single customers
-        switch, a good channel that alone sees a step lies 4 to 6 σ off, and to refuse it costs more
-        than the few errors of that size do.
+        c: refused if the innovation lies more than c of its σ away from what all other channels and
+        the forecast predict.
+    doubt : float
+        How many times larger the forecast's σ is taken to be for that. Loads are heavy-tailed:
+        where a customer switches, the few channels that see it lie far off and are right. An error
+        shows against its neighbours whatever the loads do. 1 for a noise without such tails.
     alone : float
-        Nor is a channel refused that lies less than so many of its own σ away from the forecast
-        alone: what only the others speak against rests on correlations that are learnt, of loads
-        and of values that are held, and these are not as certain as S has them.
+        A channel that lies less than so many of its own σ away from the forecast alone is not
+        refused: what only the others speak against rests on correlations that are learnt, of loads
+        and of values that are held, and these are not as certain as the covariance has them.
+    certain : float
+        Unless it lies so many σ away from what the others predict. Where the forecast knows next to
+        nothing, as with one variance for all voltages, nothing is odd by itself.
     largest_share : float
         Share of the channels of a snapshot that may be refused: if more seem wrong, the forecast
         is.
     """
 
-    factor: float = 6.0
+    factor: float = 4.0
+    doubt: float = 5.0
     alone: float = 2.5
+    certain: float = 20.0
     largest_share: float = 0.25
 
     def __post_init__(self) -> None:
-        if not (self.factor > 0 and self.alone >= 0 and 0 < self.largest_share < 1):
+        if not (
+            0 < self.factor <= self.certain
+            and self.doubt >= 1
+            and self.alone >= 0
+            and 0 < self.largest_share < 1
+        ):
             raise ParameterError(
-                "screening: expected factor > 0, alone ≥ 0 and 0 < largest_share < 1, received "
-                f"{self.factor}, {self.alone} and {self.largest_share}"
+                "screening: expected 0 < factor ≤ certain, doubt ≥ 1, alone ≥ 0 and "
+                f"0 < largest_share < 1, received {self}"
             )
 
 
@@ -74,29 +87,28 @@ def refuse(params: InnovationParams | None = None) -> Refuse:
     With M = S⁻¹ the innovation of channel i, given those of all others, has the mean
     η_i - (Mη)_i/M_ii and the variance 1/M_ii; so |(Mη)_i|/√M_ii is the largest normalised residual
     of a least-squares estimate that counts the forecast among its measurements. Taking a channel
-    out changes M by one rank.
+    out changes M by one rank. A snapshot in which no channel is odd under S itself passes; the
+    others are judged under R + doubt² (S - R).
     """
     params = params or InnovationParams()
+    doubt = params.doubt**2
 
-    def refused(innovation: FloatArray, chol_S: FloatArray) -> BoolArray:
+    def refused(innovation: FloatArray, chol_S: FloatArray, sigma: FloatArray) -> BoolArray:
         m = len(innovation)
         out = np.zeros(m, dtype=bool)
-        own_variance = np.einsum("ij,ij->i", chol_S, chol_S)
-        expected = innovation**2 <= params.alone**2 * own_variance
-        if expected.all():
+        expected = innovation**2 <= params.alone**2 * np.einsum("ij,ij->i", chol_S, chol_S)
+        bound = np.where(expected, params.certain, params.factor)
+        if not _odd(innovation, chol_S, bound):
             return out
-        inverse, _ = linalg.lapack.dtrtri(chol_S, lower=1)
-        y = inverse.T @ (inverse @ innovation)
-        # Most snapshots hold no error: the diagonal of M = L⁻ᵀL⁻¹ is enough to see that.
-        odd = y * y > params.factor**2 * np.einsum("ij,ij->j", inverse, inverse)
-        if not (odd & ~expected).any():
-            return out
-        M = inverse.T @ inverse
+        doubtful = doubt * (chol_S @ chol_S.T)
+        doubtful.flat[:: m + 1] -= (doubt - 1.0) * sigma**2
+        M = _inverse(doubtful)
+        y = M @ innovation
         for _ in range(int(params.largest_share * m)):
-            variance = np.where(out | expected, np.inf, np.diagonal(M))
-            suspicion = np.abs(y) / np.sqrt(variance)
+            variance = np.where(out, np.inf, np.diagonal(M))
+            suspicion = np.abs(y) / (bound * np.sqrt(variance))
             worst = int(suspicion.argmax())
-            if suspicion[worst] <= params.factor:
+            if suspicion[worst] <= 1.0:
                 return out
             out[worst] = True
             column, own = M[:, worst].copy(), M[worst, worst]
@@ -105,3 +117,26 @@ def refuse(params: InnovationParams | None = None) -> Refuse:
         return out
 
     return refused
+
+
+def _odd(innovation: FloatArray, chol_S: FloatArray, bound: FloatArray) -> bool:
+    """Whether any |(S⁻¹η)_i| exceeds its bound times √(S⁻¹)_ii."""
+    white, _ = lapack.dtrtrs(chol_S, innovation, lower=1)
+    # No residual is larger than √(ηᵀS⁻¹η), so that few rows need a look.
+    rows = np.flatnonzero(bound**2 < white @ white)
+    if not len(rows):
+        return False
+    columns = np.zeros((len(innovation), len(rows)), order="F")
+    columns[rows, np.arange(len(rows))] = 1.0
+    columns, _ = lapack.dtrtrs(chol_S, columns, lower=1, overwrite_b=1)
+    square = np.einsum("ij,ij->j", columns, columns)
+    return bool(((white @ columns) ** 2 > bound[rows] ** 2 * square).any())
+
+
+def _inverse(S: FloatArray) -> FloatArray:
+    """S⁻¹ of a positive definite matrix, both halves."""
+    # A symmetric matrix is its own transpose in the order that LAPACK reads.
+    factor, _ = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
+    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
+    inverse += np.tril(inverse, -1).T
+    return np.asarray(inverse)
