@@ -283,3 +283,51 @@ def test_few_voltage_phasors_and_current_phasors_suffice_from_a_flat_start(grid:
     solution = WeightedLeastSquares(network, layout).solve(z, sigma)
     assert solution.converged
     assert np.abs(solution.x - truth).max() < 0.02
+
+
+def test_a_flat_start_knows_what_phase_shifters_turn() -> None:
+    network = library.load("ieee33")
+    shift = np.zeros(network.n_branch)
+    shift[0] = np.deg2rad(150.0)
+    network = dataclasses.replace(
+        network, branches=dataclasses.replace(network.branches, shift_rad=shift)
+    )
+    for layout in (conventional(network), every_quantity(network)):
+        truth = solve(network).x
+        solution = WeightedLeastSquares(network, layout).solve(
+            measured(network, layout, truth), np.full(len(layout), 0.01), layout.quantity < IM
+        )
+        assert solution.converged
+        np.testing.assert_allclose(solution.x, truth, atol=1e-9)
+
+
+def test_without_the_angles_of_a_layout_the_slack_is_the_reference() -> None:
+    network = library.load("ieee14")
+    bus = np.arange(network.n_bus)
+    angle = (VA, np.array([2, 5]), BUS)
+    layout = SensorLayout.of(network, (VM, bus, BUS), (P, bus, BUS), (Q, bus, BUS), angle)
+    silent = layout.quantity != VA
+    rng = np.random.default_rng(SEED)
+    sigma = np.full(len(layout), 0.01)
+    z = measured(network, layout, solve(network).x) + sigma * rng.normal(size=len(layout))
+    with_angles, without = (
+        WeightedLeastSquares(network, layout),
+        layout.take(np.flatnonzero(silent)),
+    )
+    found = with_angles.solve(z, sigma, silent)
+    plain = WeightedLeastSquares(network, without).solve(z[silent], sigma[silent])
+    assert found.pinned
+    assert not plain.pinned
+    np.testing.assert_allclose(found.x, plain.x, atol=1e-8)
+    # A tracking filter stays where the reference last was, and comes back to it.
+    tracking = tracking_wls("wls", network, layout)
+    turned = np.where(layout.quantity == VA, z + 0.3, z)
+    state, _ = tracking.init(snapshot(turned, sigma))
+    last = tracking.read(state).x[network.slack]
+    state, info = tracking.step(state, snapshot(turned, sigma, silent, 1))
+    assert info.status is Status.OK
+    assert "no angle" in info.detail
+    assert tracking.read(state).x[network.slack] == pytest.approx(last, abs=1e-9)
+    state, info = tracking.step(state, snapshot(turned, sigma, step=2))
+    assert tracking.read(state).x[network.slack] == pytest.approx(last, abs=1e-6)
+    assert info.detail == ""

@@ -167,3 +167,17 @@ def test_base_power_changes_the_units_and_nothing_else() -> None:
     flow, same = solve(network), solve(other)
     np.testing.assert_allclose(same.x, flow.x, atol=1e-10)
     np.testing.assert_allclose(same.p_pu * 37.0, flow.p_pu * network.base_mva, atol=1e-7)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 150.0, 180.0, -120.0])
+def test_a_phase_shifter_turns_what_lies_behind_it_and_nothing_else(degrees: float) -> None:
+    network = library.load("ieee33")
+    shift = np.zeros(network.n_branch)
+    shift[0] = np.deg2rad(degrees)  # the branch from the slack, behind which everything lies
+    turned = dataclasses.replace(
+        network, branches=dataclasses.replace(network.branches, shift_rad=shift)
+    )
+    plain, found = (solve(n).x[:, None].reshape(2, -1) for n in (network, turned))
+    np.testing.assert_allclose(found[1], plain[1], atol=1e-9)
+    np.testing.assert_allclose(found[0, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found[0, 1:], plain[0, 1:] - shift[0], atol=1e-9)

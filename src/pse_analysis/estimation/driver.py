@@ -163,10 +163,18 @@ def _nees(estimate: Estimate | None, truth: FloatArray | None, folded: BoolArray
 
 
 def _consistent(nis: FloatArray, dof: npt.NDArray[np.int64]) -> BoolArray:
-    """Whether NIS of the last steps stays inside its bounds, at every step."""
+    """Whether NIS of the last steps stays inside its bounds, at every step.
+
+    At the start there are fewer; the first alone is as much as a single snapshot has to show.
+    """
     known = np.isfinite(nis) & (dof > 0)
-    total = pd.Series(np.where(known, nis, 0.0)).rolling(CONSISTENCY_STEPS).sum().to_numpy()
-    freedom = pd.Series(np.where(known, dof, 0)).rolling(CONSISTENCY_STEPS).sum().to_numpy()
+    total, freedom = (
+        pd.Series(np.where(known, part, 0.0))
+        .rolling(CONSISTENCY_STEPS, min_periods=1)
+        .sum()
+        .to_numpy()
+        for part in (nis, dof)
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         low, high = stats.chi2.ppf([[0.0005], [0.9995]], freedom)
         ratio = total / freedom

@@ -7,6 +7,7 @@ known in advance, and one factorisation gives the step, and at the end the covar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,19 @@ BoolArray = npt.NDArray[np.bool_]
 
 COARSE = 1e-2
 """Largest step of a converged state whose rows are weighed by their residuals. [rad, p.u.]"""
+ASSUMED = 1e-3
+"""σ of the slack's angle where nothing ever told it. [rad]
+
+It is taken for the reference then. A wide σ would be of no use to a filter that starts from it: its
+powers are currents in the frame of the predicted voltage, which sees a turn of the whole grid.
+"""
+
+
+class Reference(NamedTuple):
+    """What is known of the slack's angle beside the measurements. [rad]"""
+
+    angle: float
+    sigma: float
 
 
 def state_columns(network: Network, layout: SensorLayout) -> npt.NDArray[np.int64]:
@@ -57,6 +71,8 @@ class WlsSolution:
         Sum of the squared whitened residuals, χ² with m - n degrees of freedom.
     iterations : int
     converged : bool
+    pinned : bool
+        The measurements told no angle, so a `Reference` did.
     """
 
     x: FloatArray
@@ -64,6 +80,7 @@ class WlsSolution:
     objective: float
     iterations: int
     converged: bool
+    pinned: bool
     _gain: _Gain
     _columns: npt.NDArray[np.int64]
 
@@ -93,9 +110,9 @@ class _Gain:
         pattern = np.where(self._indices == self._column, float(n), -0.5 / n)
         self._matrix.data = pattern
         self._order = np.argsort(self._superlu("MMD_AT_PLUS_A").perm_c)
-        place = np.empty(n, dtype=np.int64)
-        place[self._order] = np.arange(n)
-        self._lay_out(place[model.indices])
+        self._place_of = np.empty(n, dtype=np.int64)
+        self._place_of[self._order] = np.arange(n)
+        self._lay_out(self._place_of[model.indices])
         self.factor: sparse_linalg.SuperLU | None = None
 
     def _lay_out(self, column_of_entry: npt.NDArray[np.int64]) -> None:
@@ -117,8 +134,8 @@ class _Gain:
             self._matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
-    def factorise(self, whitened: FloatArray) -> None:
-        """Factorise the gain of whitened Jacobian entries.
+    def factorise(self, whitened: FloatArray, pin: tuple[int, float] | None = None) -> None:
+        """Factorise the gain of whitened Jacobian entries, and of what is known of one column.
 
         Raises
         ------
@@ -130,6 +147,9 @@ class _Gain:
             weights=whitened[self._left] * whitened[self._right],
             minlength=len(self._indices),
         )
+        if pin is not None:
+            column, weight = pin
+            data[self._own[self._place_of[column]]] += weight
         diagonal = data[self._own]
         if not (diagonal > 0).all():
             raise Unobservable("a state is in no measurement")
@@ -186,9 +206,8 @@ class WeightedLeastSquares:
         self._current = np.isin(layout.quantity, (IM, IA))
 
     def flat_start(self) -> FloatArray:
-        """[θ; |V|] with no angle and rated voltage. (2N,)"""
-        n = self.network.n_bus
-        return np.concatenate([np.zeros(n), np.ones(n)])
+        """[θ; |V|] with rated voltage and no angle but that of phase shifters. (2N,)"""
+        return np.concatenate([self.network.resting_angle_rad, np.ones(self.network.n_bus)])
 
     def solve(
         self,
@@ -198,6 +217,7 @@ class WeightedLeastSquares:
         *,
         start: FloatArray | None = None,
         huber: float | None = None,
+        reference: Reference | None = None,
     ) -> WlsSolution:
         """Estimate the state.
 
@@ -214,6 +234,9 @@ class WeightedLeastSquares:
             Residual, in units of σ, beyond which the cost of a row grows with the residual instead
             of its square, so that no row pulls harder; to `COARSE`, and with the covariance of the
             weights at the end.
+        reference : Reference, optional
+            What stands for the angle reference if the layout has one and no angle is available; by
+            default the slack's angle of the start.
 
         Returns
         -------
@@ -233,8 +256,15 @@ class WeightedLeastSquares:
         x: FloatArray = self.flat_start() if start is None else start.copy()
         if start is None and (self._current & rows).any():
             x = self._linear_start(observed, sigma, rows)
+        layout, slack = self.model.layout, self.network.slack
+        silent = layout.has_angle and not (rows & layout.angular).any()
+        if silent:
+            reference = reference or Reference(x[slack], ASSUMED)
+            x[: self.network.n_bus] += reference.angle - x[slack]
+        else:
+            reference = None
         try:
-            x, iterations, converged = self._iterate(x, observed, weight, huber)
+            x, iterations, converged = self._iterate(x, observed, weight, huber, reference)
         except Unobservable as error:
             raise Unobservable(self._explain(x, weight, str(error))) from error
         residual = self.model.residual(observed, x)
@@ -244,6 +274,7 @@ class WeightedLeastSquares:
             objective=float(np.sum((weight * residual) ** 2)),
             iterations=iterations,
             converged=converged,
+            pinned=silent,
             _gain=self._gain,
             _columns=self.model.columns,
         )
@@ -256,27 +287,35 @@ class WeightedLeastSquares:
         """
         n = self.network.n_bus
         linear = RectangularModel(self.network, self.model.layout)
-        H, target, spread = linear.rows(z, sigma, rows, np.ones(n, dtype=np.complex128))
+        resting = np.exp(1j * self.network.resting_angle_rad)
+        H, target, spread = linear.rows(z, sigma, rows, resting)
         read = rows & (~self._current | linear.paired(rows))
         weight = np.where(read, 1.0 / np.where(read, spread, 1.0), 0.0)
         whitened = sparse.csr_array(sparse.diags_array(weight) @ H)
-        rated = np.concatenate([np.ones(n), np.zeros(n)])
+        rated = np.concatenate([resting.real, resting.imag])
         # A prior of σ = 1 p.u. makes the gain regular and moves what is measured next to nothing.
         gain = sparse.csc_array(whitened.T @ whitened + sparse.eye_array(2 * n))
         x = rated + sparse_linalg.splu(gain).solve(
             whitened.T @ (weight * np.where(read, target, 0.0) - whitened @ rated)
         )
         voltage = x[:n] + 1j * x[n:]
-        if not self.model.layout.has_angle:
+        if not (self.model.layout.angular & rows).any():
             voltage = voltage * np.exp(-1j * np.angle(voltage[self.network.slack]))
         if (np.abs(voltage) < 0.1).any():
             return self.flat_start()
         return np.concatenate([np.angle(voltage), np.abs(voltage)])
 
     def _iterate(
-        self, x: FloatArray, z: FloatArray, weight: FloatArray, huber: float | None
+        self,
+        x: FloatArray,
+        z: FloatArray,
+        weight: FloatArray,
+        huber: float | None,
+        reference: Reference | None,
     ) -> tuple[FloatArray, int, bool]:
-        model = self.model
+        model, slack = self.model, self.network.slack
+        # The measurements leave the slack's angle where it is: to pin it takes no pull.
+        pin = None if reference is None else (slack, reference.sigma**-2)
         tolerance = self.tolerance if huber is None else COARSE
         counted = weight
         for iteration in range(1, self.max_iterations + 1):
@@ -285,7 +324,7 @@ class WeightedLeastSquares:
                 far = np.maximum(np.abs(weight * residual) / huber, 1.0)
                 counted = weight / np.sqrt(far)
             whitened = model.jacobian_data(x) * counted[model.row_of_entry]
-            self._gain.factorise(whitened)
+            self._gain.factorise(whitened, pin)
             gradient = np.bincount(
                 model.indices,
                 weights=whitened * (counted * residual)[model.row_of_entry],
@@ -305,6 +344,8 @@ class WeightedLeastSquares:
         """Which buses the measurements leave open, from the null space of the whitened Jacobian."""
         model, n = self.model, self.network.n_bus
         dense = model.jacobian(x).toarray() * weight[:, None]
+        if model.layout.has_angle and not (model.layout.angular & (weight > 0)).any():
+            dense = np.vstack([dense, np.eye(1, dense.shape[1], self.network.slack)])
         norm = np.linalg.norm(dense, axis=0)
         _, singular, vectors = np.linalg.svd(
             dense / np.where(norm > 0, norm, 1.0), full_matrices=True
@@ -327,6 +368,9 @@ class WeightedLeastSquares:
         )
 
 
+NO_ANGLE = "no angle is measured: angles are against the slack's, which stays where it was last"
+
+
 @dataclass(frozen=True, eq=False)
 class _WlsState:
     x: FloatArray
@@ -345,17 +389,23 @@ def tracking_wls(name: str, network: Network, layout: SensorLayout) -> Estimator
     Returns
     -------
     Estimator
-        Held samples take part, with the σ that age gave them; the previous estimate is no prior.
+        Held samples take part, with the σ that age gave them; the previous estimate is no prior,
+        but for the slack's angle while no angle is measured.
     """
     wls = WeightedLeastSquares(network, layout)
     model = wls.model
 
-    def solve(start: FloatArray | None, snapshot: Snapshot) -> tuple[_WlsState | None, Info]:
-        m = len(layout)
+    def solve(last: _WlsState | None, snapshot: Snapshot) -> tuple[_WlsState | None, Info]:
+        m, given = len(layout), (snapshot.z, snapshot.sigma, snapshot.available)
+        start, reference = None, None
+        if last is not None:
+            start = last.x
+            spread = np.sqrt(last.covariance[network.slack, network.slack])
+            reference = Reference(start[network.slack], spread) if spread > 0 else None
         try:
-            solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available, start=start)
+            solution = wls.solve(*given, start=start, reference=reference)
             if not solution.converged and start is not None:
-                solution = wls.solve(snapshot.z, snapshot.sigma, snapshot.available)
+                solution = wls.solve(*given, reference=reference)
         except Unobservable as error:
             return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
         if not solution.converged:
@@ -372,11 +422,12 @@ def tracking_wls(name: str, network: Network, layout: SensorLayout) -> Estimator
             Status.OK,
             solution.iterations,
             solution.objective,
-            max(int(used.sum()) - model.shape[1], 0),
+            max(int(used.sum()) + int(solution.pinned) - model.shape[1], 0),
             used,
             solution.residual,
             np.where(used, np.sqrt(left), np.nan),
             np.zeros(m),
+            NO_ANGLE if solution.pinned else "",
         )
         return _WlsState(solution.x, covariance), info
 
@@ -384,7 +435,7 @@ def tracking_wls(name: str, network: Network, layout: SensorLayout) -> Estimator
         return solve(None, snapshot)
 
     def step(state: _WlsState, snapshot: Snapshot) -> tuple[_WlsState | None, Info]:
-        return solve(state.x, snapshot)
+        return solve(state, snapshot)
 
     def read(state: _WlsState) -> Voltages:
         return Voltages(state.x, state.covariance)

@@ -247,17 +247,44 @@ class Network:
             self, branches=dataclasses.replace(self.branches, in_service=in_service)
         )
 
+    @cached_property
+    def resting_angle_rad(self) -> FloatArray:
+        """Angles without load: what phase shifters turn a bus against the slack. (n_bus,) [rad]
+
+        Along one tree of branches in service; around a loop shifts may disagree.
+        """
+        branch = self.branches
+        angle = np.zeros(self.n_bus)
+        turning = branch.in_service & (branch.shift_rad != 0)
+        if not turning.any():
+            return angle
+        # V_from = a e^{jφ} V_to without current.
+        shift = {}
+        for k in np.flatnonzero(branch.in_service):
+            begin, end = int(branch.from_bus[k]), int(branch.to_bus[k])
+            shift[begin, end], shift[end, begin] = -branch.shift_rad[k], branch.shift_rad[k]
+        order, before = sparse.csgraph.breadth_first_order(
+            self._connections, self.slack, directed=False
+        )
+        for bus in order[1:]:
+            angle[bus] = angle[before[bus]] + shift[int(before[bus]), int(bus)]
+        return angle
+
     def islands(self) -> npt.NDArray[np.int32]:
         """Label of the connected component of each bus. (n_bus,)"""
+        return np.asarray(sparse.csgraph.connected_components(self._connections, directed=False)[1])
+
+    @property
+    def _connections(self) -> sparse.csr_array:
+        """Which buses the branches in service connect."""
         closed = self.branches.in_service
-        graph = sparse.coo_array(
+        return sparse.csr_array(
             (
                 np.ones(int(closed.sum())),
                 (self.branches.from_bus[closed], self.branches.to_bus[closed]),
             ),
             shape=(self.n_bus, self.n_bus),
         )
-        return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])
 
     # ---------------------------------------------------------------------------------- tables
 

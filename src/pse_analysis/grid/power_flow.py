@@ -71,7 +71,7 @@ def solve(
     vm_set_pu : like p_pu, optional
         Voltage of slack and PV buses; nominal by default. [p.u.]
     start : (2 n_bus,) or (2 n_bus, n_state) ndarray, optional
-        [θ; |V|] to start from; flat by default.
+        [θ; |V|] to start from; by default flat, but for what phase shifters turn.
     enforce_q_limits : bool
         Turn PV buses whose generation leaves its reactive limits into PQ buses at the limit.
     tolerance : float
@@ -112,7 +112,7 @@ def solve(
             )
     x = np.empty((2 * network.n_bus, p.shape[1]))
     if start is None:
-        x[: network.n_bus] = 0.0
+        x[: network.n_bus] = network.resting_angle_rad[:, None]
         x[network.n_bus :] = np.where((network.buses.kind == BusKind.PQ)[:, None], 1.0, vm_set)
     else:
         x[:] = start if np.ndim(start) == 2 else np.asarray(start)[:, None]
