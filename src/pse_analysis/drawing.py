@@ -61,6 +61,7 @@ REASONS: MappingProxyType[Reason, str] = MappingProxyType(
         Reason.QUALITY: PURPLE,
         Reason.STEP_ACCEPTED: GREY,
         Reason.INNOVATION: VERMILION,
+        Reason.AHEAD: YELLOW,
     }
 )
 

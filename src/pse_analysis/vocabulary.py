@@ -143,6 +143,7 @@ class Reason(enum.IntFlag):
     QUALITY = 512
     STEP_ACCEPTED = 1024
     INNOVATION = 2048
+    AHEAD = 4096
 
 
 SEVERITY: MappingProxyType[Reason, Flag] = MappingProxyType(
@@ -159,6 +160,7 @@ SEVERITY: MappingProxyType[Reason, Flag] = MappingProxyType(
         Reason.QUALITY: Flag.BAD,
         Reason.STEP_ACCEPTED: Flag.GOOD,
         Reason.INNOVATION: Flag.BAD,
+        Reason.AHEAD: Flag.BAD,
     }
 )
 """Severity that each reason carries on its own; a sample gets the largest of its reasons."""

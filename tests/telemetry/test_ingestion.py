@@ -104,9 +104,15 @@ def test_seq_is_the_order_of_arrival():
     voltage = raw.telemetry[raw.telemetry.channel == "U6"]
     assert list(voltage.seq) == [0, 1]
     assert list(voltage.value * 12.66) == pytest.approx([12.5, 12.66])
-    unknown = ingest(frame().iloc[::-1], channels(), feeder()).telemetry
-    assert list(unknown[unknown.channel == "U6"].value * 12.66) == pytest.approx([12.5, 12.66])
-    assert unknown.arrival_utc.isna().all()
+
+
+def test_without_arrival_seq_is_the_order_of_time_whatever_that_of_the_rows(caplog):
+    forward = ingest(frame(), channels(), feeder()).telemetry
+    assert not caplog.records
+    backward = ingest(frame().iloc[::-1], channels(), feeder()).telemetry
+    pd.testing.assert_frame_equal(backward, forward)
+    assert backward.arrival_utc.isna().all()
+    assert "sorted" in caplog.text
 
 
 def test_trials_and_quality_codes_are_kept():

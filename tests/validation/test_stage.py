@@ -106,6 +106,39 @@ def test_sample_faults_get_their_reason() -> None:
     assert {i: r for i, r in enumerate(found) if r} == expected
 
 
+def test_a_stamp_from_the_future_costs_itself_and_nothing_after_it() -> None:
+    hour = 3600.0
+    for known, at in ((True, [20]), (False, [20]), (False, [0]), (False, [20, 21]), (False, [39])):
+        value, seconds = walk(40), np.arange(40) * 300.0
+        value[25] += 30.0
+        frame = telemetry(value, seconds)
+        seconds[at] += 6.0 * 365.0 * 24.0 * hour
+        frame["time_utc"] = telemetry(value, seconds)["time_utc"]
+        listed = channels()
+        if not known:
+            frame["arrival_utc"] = pd.Series(pd.NaT, frame.index, frame["arrival_utc"].dtype)
+            other = telemetry(walk(40)).assign(channel="other", arrival_utc=frame["arrival_utc"])
+            listed = pd.concat([listed, channels(channel="other")], ignore_index=True)
+            frame = pd.concat([frame, other], ignore_index=True)
+        found = validate(frame, listed, GIVEN)["reasons"].tolist()
+        after = {at[-1] + 1: Reason.GAP} if 0 < at[-1] < 39 else {}
+        expected = {**dict.fromkeys(at, Reason.AHEAD), **after, 25: Reason.INCREMENT}
+        assert {i: r for i, r in enumerate(found) if r} == expected
+
+
+def test_a_clock_less_than_a_period_ahead_and_a_backfill_after_an_outage_are_no_such_stamps() -> (
+    None
+):
+    frame = telemetry(walk(40))
+    frame["arrival_utc"] = frame["time_utc"] - pd.Timedelta("200s").as_unit("us")
+    assert not any(reasons(frame))
+    seconds = np.r_[0:10, 30:40, 10:30] * 300.0
+    frame = telemetry(walk(40), seconds)
+    frame["arrival_utc"] = pd.Series(pd.NaT, frame.index, frame["arrival_utc"].dtype)
+    params = ValidateParams((Rule(increment=100.0),))
+    assert reasons(frame, params) == [0] * 10 + [Reason.GAP] + [0] * 9 + [Reason.BACKWARD] * 20
+
+
 def test_a_telegram_delivered_twice_is_a_duplicate_even_with_two_stamps() -> None:
     value, seconds = walk(40), np.arange(40) * 300.0
     value[21], seconds[21] = value[20], seconds[20] + 40.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Literal
 
@@ -14,6 +15,8 @@ from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.telemetry.channels import check_channels, check_known, check_shunts
 from pse_analysis.telemetry.tables import RawCase
 from pse_analysis.vocabulary import UNITS, Quantity, check
+
+log = logging.getLogger(__name__)
 
 _UNIT_NAMES = {
     "p.u.": "pu",
@@ -75,7 +78,7 @@ def ingest(
     RawCase
         Telemetry and channels in this project's convention: every value in the first unit of its
         quantity, every sign 1, times in UTC and microseconds, ``seq`` by order of arrival (of
-        rows, where no arrival is known).
+        time, where no arrival is known).
 
     Raises
     ------
@@ -137,8 +140,11 @@ def ingest(
             "quality": pd.array(_integers(frame, "quality", None), dtype="Int16"),
         }
     )
-    order = arrival.fillna(time).argsort(kind="stable").to_numpy() if known else None
-    telemetry = telemetry if order is None else telemetry.take(order)
+    # Rows of an export stand in any order; without arrivals only the stamps tell which came first.
+    by_channel = telemetry.groupby(["trial", "channel"])["time_utc"]
+    if not known and not by_channel.is_monotonic_increasing.all():
+        log.warning("telemetry: rows are not in order of time and no arrival_utc is known: sorted")
+    telemetry = telemetry.take(arrival.fillna(time).argsort(kind="stable").to_numpy())
     telemetry["seq"] = telemetry.groupby(["trial", "channel"]).cumcount().astype(np.int64)
     translated = _translated(standard, ratio)
     if shunts == "refuse" and isinstance(model, Network):

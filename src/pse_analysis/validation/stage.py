@@ -75,7 +75,8 @@ def validate(
 
     Notes
     -----
-    From ``history_end`` on, flags depend on samples up to their own only.
+    From ``history_end`` on, flags depend on samples up to their own only; but a stamp that has
+    jumped ahead is known by the next one, well before the time it claims.
     """
     params = ValidateParams() if params is None else params
     rules = resolve(channels, params)
@@ -101,7 +102,8 @@ def validate(
     late = np.array([np.nan if r.late_s is None else r.late_s for r in lane_rules])
     reasons, backward = time_reasons(stamps, value, period, late, history)
     checks_time = np.array(["time" in (r.checks or ()) for r in lane_rules], dtype=bool)
-    reasons[~checks_time[stamps.lane]] &= int(Reason.DUPLICATE | Reason.BACKWARD)
+    always = Reason.DUPLICATE | Reason.BACKWARD | Reason.AHEAD
+    reasons[~checks_time[stamps.lane]] &= int(always)
     reasons |= _quality(telemetry["quality"].iloc[order], lane_rules, stamps.lane)
 
     statistic, threshold = np.full(len(value), np.nan), np.full(len(value), np.nan)

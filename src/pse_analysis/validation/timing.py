@@ -1,4 +1,4 @@
-"""The time checks: late, duplicate and backward stamps, gaps."""
+"""The time checks: stamps from the future, late, duplicate and backward ones, gaps."""
 
 from __future__ import annotations
 
@@ -15,6 +15,15 @@ Bools = npt.NDArray[np.bool_]
 
 GAP_PERIODS = 1.5
 """Elapsed periods from which at least one sample is missing."""
+
+FAR_PERIODS = 10.0
+"""Periods ahead from which a stamp that the next ones contradict is no gap but a wrong clock."""
+
+AHEAD_RUN = 3
+"""Such stamps in a row at most: a longer run may as well be live samples before a backfill."""
+
+SKEW_S = 10.0
+"""Least lead of a stamp over its own arrival that is no skew of clocks. [s]"""
 
 NO_TIME = np.iinfo(np.int64).min
 
@@ -48,17 +57,57 @@ class Stamps:
         return np.asarray(self.arrival != NO_TIME)
 
 
-def latest_before(stamps: Stamps) -> Ints:
-    """Latest stamp among the earlier samples of the lane; `NO_TIME` for its first."""
+def ahead(stamps: Stamps, period_s: Array) -> Bools:
+    """Samples whose stamp lies in the future.
+
+    Where the arrival is known, a stamp more than a period (`SKEW_S` at least) after it is
+    impossible; a smaller lead is a skew of clocks that leaves the samples in their order. Where it
+    is not, a stamp has jumped that lies more than `FAR_PERIODS` ahead and is followed, after
+    `AHEAD_RUN` samples at most, by one that goes on where the others were; or that has run so far
+    ahead, as the last of its lane, of every sample of the other lanes.
+    """
+    time, lane = stamps.time, stamps.lane
+    period = period_s[lane] * 1e6
+    out = stamps.arrived.copy()
+    out[out] = (time[out] - stamps.arrival[out]) > np.maximum(period[out], SKEW_S * 1e6)
+    unknown = ~stamps.arrived & ~out
+    if not unknown.any():
+        return out
+    far = FAR_PERIODS * period
+    # A step back over the far distance is rare, so what stands before it is looked at one by one.
+    back = (lane[1:] == lane[:-1]) & (time[:-1] - time[1:] > far[1:])
+    for at in np.flatnonzero(back) + 1:
+        first = stamps.start[lane[at]]
+        for start in range(at - 1, max(at - AHEAD_RUN, first) - 1, -1):
+            run = slice(start, at)
+            if not (unknown[run].all() and (time[run] - time[at] > far[at]).all()):
+                break
+            goes_on = start == first or 0 <= time[at] - time[start - 1] <= far[at]
+            if goes_on:
+                out[run] = True
+                break
+    if len(stamps.start) > 1:
+        top = np.maximum.reduceat(np.where(out, NO_TIME, time), stamps.start)
+        leader = int(np.argmax(top))
+        final = int(stamps.start[leader] + stamps.length[leader] - 1)
+        others = max(int(np.delete(top, leader).max()), int(time[final - 1]))
+        if stamps.length[leader] > 1 and unknown[final] and time[final] - others > far[final]:
+            out[final] = True
+    return out
+
+
+def latest_before(stamps: Stamps, wrong: Bools | None = None) -> Ints:
+    """Latest stamp among the earlier samples of the lane; `NO_TIME` where there is none."""
     out = np.full(len(stamps.time), NO_TIME)
     if not len(stamps.time):
         return out
     # Ranks keep lanes apart in one running maximum without overflow.
-    order = np.lexsort((stamps.time, stamps.lane))
+    time = stamps.time if wrong is None else np.where(wrong, NO_TIME, stamps.time)
+    order = np.lexsort((time, stamps.lane))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     top = order[np.maximum.accumulate(rank)]
-    out[1:] = stamps.time[top[:-1]]
+    out[1:] = time[top[:-1]]
     out[stamps.start] = NO_TIME
     return out
 
@@ -122,8 +171,9 @@ def time_reasons(
         Samples that the usual delay is learnt from.
     """
     reasons = np.zeros(len(stamps.time), dtype=np.int32)
-    latest = latest_before(stamps)
-    some = latest != NO_TIME
+    future = ahead(stamps, period_s)
+    latest = latest_before(stamps, future)
+    some = (latest != NO_TIME) & ~future
     repeated = duplicates(stamps) | echoes(stamps, value, period_s)
     backward = some & (stamps.time < latest) & ~repeated
     period = period_s[stamps.lane] * 1e6
@@ -133,6 +183,7 @@ def time_reasons(
     late = stamps.arrived.copy()
     late[late] = (stamps.arrival[late] - stamps.time[late]) > allowed[stamps.lane[late]] * 1e6
     for where, reason in (
+        (future, Reason.AHEAD),
         (repeated, Reason.DUPLICATE),
         (backward, Reason.BACKWARD),
         (gap, Reason.GAP),
