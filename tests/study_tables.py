@@ -109,6 +109,7 @@ def study_tables(n_instant: int = 288, n_trial: int = 2) -> StudyTables:
                     "dof": np.int32(dof),
                     "rejected": np.int32(0),
                     "seconds": 1e-3,
+                    "detail": "",
                 }
             )
         )

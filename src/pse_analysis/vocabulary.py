@@ -354,6 +354,7 @@ def schema(table: str) -> pa.DataFrameSchema:
             "dof": col("int32"),
             "rejected": col("int32"),
             "seconds": col("float64"),
+            "detail": text(),
         },
         "scored": {
             "method": text(),

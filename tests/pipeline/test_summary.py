@@ -31,8 +31,27 @@ def scored() -> pd.DataFrame:
 
 def test_means_are_averaged_and_largest_errors_are_not(scored: pd.DataFrame) -> None:
     line = next(line for line in text("a case", scored).splitlines() if "wls" in line)
-    # Thousandths of p.u., thousandths of a degree, shares; unknown metrics stay a dash.
-    assert line.split() == ["wls", "2.000", "20.00", "57.3", *"–––", "95.0%", *"–––"]
+    # Thousandths of p.u., thousandths of a degree, shares; of what is unknown nothing is said.
+    assert line.split() == ["wls", "2.000", "20.00", "57.3", "95.0%"]
+
+
+def test_what_one_method_does_not_know_is_a_dash_beside_those_that_do(scored: pd.DataFrame) -> None:
+    other = pd.DataFrame([("kf", 0, "nis_ratio", "", 1.0, "")], columns=scored.columns)
+    table = text("a case", pd.concat([scored, other]), order=["kf", "wls"]).splitlines()
+    kf, wls = (next(k for k, line in enumerate(table) if name in line) for name in ("kf", "wls"))
+    assert kf < wls
+    assert table[kf].split() == ["kf", *"–––", "1.00", "–"]
+
+
+def test_without_truth_the_table_says_so_and_shows_no_empty_column() -> None:
+    rows = [("wls", 0, "nis_ratio", "", 1.0, ""), ("wls", 0, "seconds", "", 2.0, "s")]
+    columns = ["method", "trial", "metric", "element", "value", "unit"]
+    table = text("a case", pd.DataFrame(rows, columns=columns), ["telemetry: 3 samples"])
+    line = next(line for line in table.splitlines() if "wls" in line)
+    assert line.split() == ["wls", "1.00", "2.0"]
+    assert "truth is not known" in " ".join(table.split())
+    assert table.rstrip().endswith("telemetry: 3 samples")
+    assert "bad data" not in table
 
 
 def test_text_is_the_same_where_a_notebook_runs_it(
@@ -72,7 +91,8 @@ def test_no_number_is_cut_off_where_filters_went_astray() -> None:
 
 
 def test_units_in_brackets_are_shown(scored: pd.DataFrame) -> None:
-    assert "[s]" in text("a case [1]", scored)
+    seconds = pd.DataFrame([("wls", 0, "seconds", "", 1.0, "s")], columns=scored.columns)
+    assert "[s]" in text("a case [1]", pd.concat([scored, seconds]))
     assert "a case [1]" in text("a case [1]", scored)
 
 
@@ -82,8 +102,8 @@ def test_bad_data_are_counted_over_trials(scored: pd.DataFrame) -> None:
     )
 
 
-def test_case_without_record_of_faults_says_so(scored: pd.DataFrame) -> None:
-    assert "no record" in detection(scored[scored.method != "validate"])
+def test_nothing_is_said_of_faults_that_nobody_recorded(scored: pd.DataFrame) -> None:
+    assert detection(scored[scored.method != "validate"]) == ""
 
 
 def test_bars_of_magnitudes_do_not_break_the_markdown_table(scored: pd.DataFrame) -> None:

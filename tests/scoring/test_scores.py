@@ -42,7 +42,7 @@ def steps(rows: list[tuple[int, str, float, int, float]]) -> pd.DataFrame:
         "steps",
         frame.assign(
             method="kf", trial=np.int32(0), iterations=np.int32(1), rejected=np.int32(0),
-            seconds=0.25, dof=frame["dof"].astype("int32"),
+            seconds=0.25, detail="", dof=frame["dof"].astype("int32"),
         ),
     )  # fmt: skip
 

@@ -210,6 +210,7 @@ def _tables(
                 dtype=np.int32,
             ),
             "seconds": np.array(trace.seconds),
+            "detail": [i.detail for i in trace.info],
         }
     )
     x, sigma = np.array(trace.x).reshape(count, n), np.array(trace.sigma).reshape(count, n)

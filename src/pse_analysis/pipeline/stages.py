@@ -15,11 +15,12 @@ import pyarrow.parquet as pq
 
 from pse_analysis import recording
 from pse_analysis.alignment import AlignParams, align
-from pse_analysis.errors import ParameterError
+from pse_analysis.errors import ParameterError, PseError
 from pse_analysis.estimation import EstimateParams, Method, estimate
 from pse_analysis.grid import library
 from pse_analysis.machine import Machine
 from pse_analysis.parameters import Study, build
+from pse_analysis.pipeline import account
 from pse_analysis.pipeline.case import Case
 from pse_analysis.pipeline.plan import SUMMARY, Job, Work
 from pse_analysis.pipeline.processes import each
@@ -184,15 +185,18 @@ def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
         "aligned",
         pq.read_table(task.aligned, filters=[("trial", "==", task.trial)]).to_pandas(),
     )
-    done = estimate(
-        aligned,
-        _channels(task.raw),
-        read_model(task.raw),
-        task.study,
-        task.method,
-        trial=task.trial,
-        truth=read_raw_table(task.raw, "truth"),
-    )
+    try:
+        done = estimate(
+            aligned,
+            _channels(task.raw),
+            read_model(task.raw),
+            task.study,
+            task.method,
+            trial=task.trial,
+            truth=read_raw_table(task.raw, "truth"),
+        )
+    except PseError as error:
+        raise type(error)(f"method {task.method.name!r}: {error}") from error
     for table in PARTS:
         write_table(task.part(table), getattr(done, table), table)
     return {table: task.part(table) for table in PARTS}
@@ -267,7 +271,11 @@ def _score(job: Job) -> None:
         expected=expected,
     )
     write_table(job.output / "scored.parquet", scored, "scored")
-    (job.output / SUMMARY).write_text(text(job.case.title, scored), encoding="utf-8")
+    told = account.of_run(
+        list(_channels(job.raw)["channel"]), validated, tables["steps"], tables["residuals"]
+    )
+    shown = job.case.title, scored, told, [m.name for m in params.estimate.methods]
+    (job.output / SUMMARY).write_text(text(*shown), encoding="utf-8")
     job.progress(2, 3, "recording")
     if not params.estimate.methods:
         recording.detected(
@@ -275,7 +283,7 @@ def _score(job: Job) -> None:
             validated,
             _channels(job.raw),
             faults,
-            summary_markdown=markdown(job.case.title, scored),
+            summary_markdown=markdown(*shown),
         )
         return
     if isinstance(model, Machine):
@@ -283,7 +291,7 @@ def _score(job: Job) -> None:
             Take(job.output / "score.rrd", job.case.name, params.study),
             tables["estimated"],
             truth,
-            summary_markdown=markdown(job.case.title, scored),
+            summary_markdown=markdown(*shown),
         )
         return
     recording.scored(
@@ -292,7 +300,7 @@ def _score(job: Job) -> None:
         tables["estimated"],
         truth,
         model,
-        summary_markdown=markdown(job.case.title, scored),
+        summary_markdown=markdown(*shown),
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Sequence
 from typing import Literal, TypeAlias
 
 import pandas as pd
@@ -76,6 +77,8 @@ CHECK_HEAD = (
 
 CHECKED = "What the checks found of the injected faults, all trials together"
 UNITS = "Mean and largest error of |V| in 1e-3 pu, of its angle in 1e-3 degree"
+NO_TRUTH = "The truth is not known, so there are no errors to show"
+WITH_TRUTH = ("vm_error_mean", "angle_rms")
 MACHINE_UNITS = "RMS error of rotor angle θ and speed ω, and when it settles into ±2σ of theory"
 
 # Errors are small: shown in thousandths, and angles of buses in degrees, as everywhere a person
@@ -84,7 +87,9 @@ _SCALE = {"pu": 1e3, "rad": 1e3 * 180.0 / math.pi, "degree": 1e3}
 _MACHINE_SCALE = {"rad": 1e3, "rad/s": 1e3}
 
 
-def text(title: str, scored: pd.DataFrame) -> str:
+def text(
+    title: str, scored: pd.DataFrame, account: Sequence[str] = (), order: Sequence[str] = ()
+) -> str:
     """Scores of the methods and of the checks, as plain text.
 
     Parameters
@@ -94,8 +99,12 @@ def text(title: str, scored: pd.DataFrame) -> str:
     scored
         Table of that name; only rows of the whole case (element "") are shown, and trials are
         brought together: largest errors by their maximum, times by their sum, others by their mean.
+    account
+        Sentences that follow, `pse_analysis.pipeline.account.of_run`.
+    order
+        Methods as they are to stand; by default as they come.
     """
-    units, head, rows = _content(scored)
+    units, head, rows = _content(scored, order)
     # As `Text`, because a unit in square brackets would be read as a style.
     table = Table(
         title=Text(f"{_title(title, scored)}\n{units}", justify="center"), title_style="",
@@ -113,31 +122,40 @@ def text(title: str, scored: pd.DataFrame) -> str:
         file=stored, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
     )
     console.print(table)
-    console.print(Text(f"\n{detection(scored)}"))
+    for paragraph in _closing(scored, account):
+        console.print()
+        console.print(Text("\n".join(textwrap.wrap(paragraph, WIDTH, subsequent_indent="  "))))
     return "\n".join(line.rstrip() for line in stored.getvalue().strip("\n").splitlines()) + "\n"
 
 
-def markdown(title: str, scored: pd.DataFrame) -> str:
+def markdown(
+    title: str, scored: pd.DataFrame, account: Sequence[str] = (), order: Sequence[str] = ()
+) -> str:
     """The same for the page of a recording."""
-    units, headings, rows = _content(scored)
+    units, headings, rows = _content(scored, order)
     head = [" ".join(heading.split()) for heading in headings]
     rule = ["---", *("---:" for _ in head[1:])]
     lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
-    return "\n".join(
-        [f"# {_title(title, scored)}", "", f"{units}.", "", *table, *lines, "", detection(scored)]
-    )
+    closing = [line for paragraph in _closing(scored, account) for line in ("", paragraph)]
+    return "\n".join([f"# {_title(title, scored)}", "", f"{units}.", "", *table, *lines, *closing])
+
+
+def _closing(scored: pd.DataFrame, account: Sequence[str]) -> list[str]:
+    """What follows the table."""
+    found = detection(scored)
+    return [*([found] if found else ()), *account]
 
 
 def detection(scored: pd.DataFrame) -> str:
-    """One line on the faults of telemetry: found, missed and false alarms, over all trials."""
+    """One line on the faults of telemetry, over all trials; "" where no record is kept of them."""
     rows = scored[(scored["method"] == "validate") & (scored["element"] == "")]
 
     def total(metric: str) -> float:
         return float(rows.loc[rows["metric"] == metric, "value"].sum())
 
     if rows.empty:
-        return "bad data: nothing to compare with, the case has no record of its faults"
+        return ""
     found, missed, false_alarms = (total(m) for m in ("found", "missed", "false_alarms"))
     injected, alarms = found + missed, found + false_alarms
     recall = f" (recall {found / injected:.0%})" if injected else ""
@@ -154,12 +172,21 @@ def _title(title: str, scored: pd.DataFrame) -> str:
     return f"{title} ({trials} trial{'s' if trials != 1 else ''})"
 
 
-def _content(scored: pd.DataFrame) -> tuple[str, list[str], list[list[str]]]:
+def _content(
+    scored: pd.DataFrame, order: Sequence[str] = ()
+) -> tuple[str, list[str], list[list[str]]]:
     """What the table is about, its head and its rows: of methods, or of checks alone."""
     if (scored["method"] == "validate").all() and len(scored):
         return CHECKED, list(CHECK_HEAD), _check_rows(scored)
     columns, units, _ = _form(scored)
-    return units, ["method", *(heading for _, heading, _, _ in columns)], _rows(scored)
+    rows = _rows(scored, order)
+    # Without a truth there are no errors, and nothing to say of them.
+    every = range(len(columns) + 1)
+    known = [k for k in every if not rows or any(row[k] != NOTHING for row in rows)]
+    if not any(columns[k - 1][0] in WITH_TRUTH for k in known if k):
+        units = NO_TRUTH
+    head = ["method", *(heading for _, heading, _, _ in columns)]
+    return units, [head[k] for k in known], [[row[k] for k in known] for row in rows]
 
 
 def _check_rows(scored: pd.DataFrame) -> list[list[str]]:
@@ -202,11 +229,12 @@ def _short(value: float, form: str) -> str:
     return found
 
 
-def _rows(scored: pd.DataFrame) -> list[list[str]]:
+def _rows(scored: pd.DataFrame, order: Sequence[str]) -> list[list[str]]:
     columns, _, scales = _form(scored)
     whole = scored[(scored["element"] == "") & (scored["method"] != "validate")]
+    there = list(dict.fromkeys(whole["method"]))
     found = []
-    for method in dict.fromkeys(whole["method"]):
+    for method in sorted(there, key=lambda m: order.index(m) if m in order else len(order)):
         own = whole[whole["method"] == method]
         cells = [str(method)]
         for metric, _, together, form in columns:
