@@ -79,6 +79,32 @@ def test_a_step_is_accepted_after_the_confirming_samples() -> None:
         assert not any(found[21 + confirm :])
 
 
+def test_a_source_that_dies_at_one_value_never_confirms_a_step() -> None:
+    value = walk(600)
+    value[400:] = -99.0
+    out = validate(telemetry(value), channels(), history_end=HISTORY_END)
+    assert (out["flag"].iloc[400:] == Flag.BAD).all()
+    assert (out["reasons"].iloc[404:] == Reason.STUCK).all()
+    coarse = np.repeat(np.rint(walk(100)), 6)
+    coarse[400:] += 30.0
+    out = validate(telemetry(coarse), channels(), history_end=HISTORY_END)
+    assert (out["flag"].iloc[400:] == Flag.BAD).sum() == 2
+
+
+@pytest.mark.parametrize("limits", [{"lower": np.nan}, {"lower": -1.0}, {"lower": 0.5}])
+def test_a_voltage_of_zero_is_never_good(limits: dict[str, float]) -> None:
+    voltage = channels(quantity="vm_pu", unit="pu", upper=np.nan, **limits)
+    value = walk(600) / 20.0
+    value[400:] = 0.0
+    value[300] = -9999.0
+    out = validate(telemetry(value), voltage, history_end=HISTORY_END)
+    assert np.flatnonzero(out["reasons"] & int(Reason.LIMIT)).tolist() == [300, *range(400, 600)]
+    without = ValidateParams((Rule(checks=("extrapolation", "stuck")),))
+    dead = validate(telemetry(value), voltage, without, history_end=HISTORY_END).iloc[400:]
+    assert (dead["flag"] == Flag.BAD).all()
+    assert (dead["reasons"].iloc[4:] == Reason.STUCK).all()
+
+
 def test_sample_faults_get_their_reason() -> None:
     value = walk(40)
     value[5], value[6], value[7] = np.nan, np.inf, 5000.0

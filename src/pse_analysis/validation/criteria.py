@@ -22,6 +22,9 @@ FEWEST_EQUAL = 5
 CHANCE_OF_RUN = 1e-6
 """Default probability that a healthy source repeats itself that often by chance."""
 
+MOSTLY = 0.5
+"""Share of repeats from which waiting for another value to confirm a step takes too long."""
+
 
 def stuck_after(repeats: Array) -> npt.NDArray[np.int64]:
     """Equal values in a row that chance explains with less than `CHANCE_OF_RUN`.
@@ -110,7 +113,8 @@ def decide(
         increment = np.where(stated, given / np.sqrt(variance[:, 1]), increment)
 
     limits = np.array([_has(r, "limits") for r in rules], dtype=bool)
-    stuck = stuck_after(np.zeros(n) if structure is None else structure.repeats)
+    repeats = np.zeros(n) if structure is None else structure.repeats
+    stuck = stuck_after(repeats)
     own = _array(rules, "stuck")
     stuck = np.where(np.isnan(own), stuck, np.nan_to_num(own)).astype(np.int64)
     checks_stuck = np.array([_has(r, "stuck") for r in rules], dtype=bool)
@@ -124,6 +128,7 @@ def decide(
             extrapolation=sharper,
             confirm=np.array([r.confirm or 1 for r in rules], dtype=np.int64),
             turn=np.full(n, np.inf) if turn is None else turn,
+            repeats=repeats > MOSTLY,
         ),
         stuck=np.where(checks_stuck, stuck, 0),
         stuck_at_zero=np.array([bool(r.stuck_at_zero) for r in rules], dtype=bool),

@@ -34,6 +34,9 @@ class Motion:
     turn : (n_channel,)
         Full turn of an angle, in whose changes whole turns do not count; inf for the rest, and
         where nothing is given. [unit]
+    repeats : (n_channel,) array of bool
+        Whether a healthy channel mostly repeats its last value. Elsewhere an exact repeat is no
+        second opinion, and confirms no step. All do where nothing is given.
     """
 
     structure: Array
@@ -42,16 +45,19 @@ class Motion:
     extrapolation: Array
     confirm: Ints
     turn: Array = field(default_factory=lambda: np.empty(0))
+    repeats: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def __post_init__(self) -> None:
         if not len(self.turn):
             object.__setattr__(self, "turn", np.full(len(self.k), np.inf))
+        if not len(self.repeats):
+            object.__setattr__(self, "repeats", np.ones(len(self.k), dtype=bool))
         shape = np.shape(self.structure)
         if len(shape) != 2 or shape[1] < 3:
             raise ValueError(
                 f"structure has shape {shape}: expected (n_channel, n_lag + 1) with n_lag ≥ 2"
             )
-        for name in ("k", "increment", "extrapolation", "confirm", "turn"):
+        for name in ("k", "increment", "extrapolation", "confirm", "turn", "repeats"):
             if getattr(self, name).shape != shape[:1]:
                 raise ValueError(
                     f"{name} has shape {getattr(self, name).shape}: expected {shape[:1]}, "

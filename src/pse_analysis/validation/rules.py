@@ -12,6 +12,7 @@ import pandas as pd
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.validation.thresholds import DEFAULT_AMPLITUDE
+from pse_analysis.vocabulary import Quantity
 
 CHECKS = ("limits", "increment", "extrapolation", "stuck", "time")
 
@@ -25,6 +26,9 @@ SCALES: Mapping[tuple[str, str], float] = {
     ("degree", "rad"): 0.017453292519943295,
     ("rad", "degree"): 57.29577951308232,
 }
+
+LEAST_VOLTAGE = 5e-324
+"""Least magnitude of a voltage, in any unit: a bus at zero has no state to be estimated."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,8 @@ class Rule:
     unit : str
         Unit of ``lower``, ``upper`` and ``increment``. Default: each channel's own.
     lower, upper : float
-        Limits in place of those in the table of channels.
+        Limits in place of those in the table of channels. A voltage magnitude must be above 0
+        whatever they say.
     increment : float
         Given threshold γ of the first increment over one sampling period, in place of a learnt
         one; √m times as large over m periods.
@@ -65,7 +70,8 @@ class Rule:
     stuck : int
         Equal values in a row that mean a stuck source. Default: from the history.
     stuck_at_zero : bool
-        Whether a run of exact zeros counts; plant at rest reads zero.
+        Whether a run of exact zeros counts. Default: of voltage magnitudes only; plant at rest
+        reads zero power.
     late_s : float
         Delay of arrival that is flagged. Default: a period above the usual delay. [s]
     bad_quality : tuple of int
@@ -151,7 +157,6 @@ DEFAULTS = Rule(
     quantile=3.0,
     k="optimal",
     confirm=2,
-    stuck_at_zero=False,
     bad_quality=(),
     time_of_day_bins=0,
 )
@@ -200,7 +205,9 @@ def resolve(channels: pd.DataFrame, params: ValidateParams) -> list[Rule]:
         values: dict[str, Any] = {
             f.name: getattr(DEFAULTS, f.name) for f in dataclasses.fields(Rule)
         }
+        voltage = quantity == Quantity.VM_PU
         values |= {"lower": _number(row.lower), "upper": _number(row.upper)}
+        values["stuck_at_zero"] = voltage
         for index, rule in enumerate(params.rules):
             if not rule.matches(source, quantity, channel):
                 continue
@@ -212,6 +219,8 @@ def resolve(channels: pd.DataFrame, params: ValidateParams) -> list[Rule]:
                 if f.name in _IN_UNIT:
                     value = value * _scale(rule.unit, str(row.unit), channel)
                 values[f.name] = value
+        if voltage and not (values["lower"] or 0.0) > 0.0:
+            values["lower"] = LEAST_VOLTAGE
         values |= {"source": source, "quantity": quantity, "channel": channel}
         resolved.append(Rule(**values))
     for rule, hit in zip(params.rules, used, strict=True):

@@ -258,8 +258,9 @@ class Walk:
         led = self._prediction.shortest(lane[which], now - state[which, _At.STEP_VALUE])
         before = state[which, _At.COUNT]
         agrees = (before >= 0.0) & (np.abs(led) <= near)
-        count = np.where(agrees, before + 1.0, 0.0)
-        enough = agrees & (count >= confirm[which])
+        same = (now == state[which, _At.STEP_VALUE]) & ~self.motion.repeats[lane[which]]
+        count = np.where(agrees, before + ~same, 0.0)
+        enough = agrees & ~same & (count >= confirm[which])
         accepted[which] = enough
         state[which, _At.COUNT] = np.where(enough, -1.0, count)
         state[which, _At.STEP_VALUE] = now
