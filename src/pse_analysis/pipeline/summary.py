@@ -105,14 +105,11 @@ def text(
         Methods as they are to stand; by default as they come.
     """
     units, head, rows = _content(scored, order)
-    # As `Text`, because a unit in square brackets would be read as a style.
-    table = Table(
-        title=Text(f"{_title(title, scored)}\n{units}", justify="center"), title_style="",
-        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1),
-    )  # fmt: skip
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
     for heading in head:
         justify: Literal["left", "right"] = "left" if heading is head[0] else "right"
         table.add_column(Text(heading), justify=justify, no_wrap=True, vertical="bottom")
+    # As `Text`, because a unit in square brackets would be read as a style.
     for row in rows:
         table.add_row(*map(Text, row))
     stored = io.StringIO()
@@ -121,6 +118,10 @@ def text(
     console = Console(
         file=stored, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
     )
+    width = console.measure(table).maximum
+    for line in (_title(title, scored), units):
+        console.print(Text(line.center(width)))
+    console.print()
     console.print(table)
     for paragraph in _closing(scored, account):
         console.print()
