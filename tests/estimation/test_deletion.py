@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from qu_bench import still
 
-from pse_analysis.estimation.deletion import Deletion
+from pse_analysis.estimation.deletion import Deletion, of_snapshot
 
 SEED = 7
 PRICE = 20.0
@@ -55,7 +56,7 @@ def test_search_finds_the_cheapest_of_all_choices() -> None:
     S, eta = correlated()
     eta[[1, 6]] += 25.0, -40.0
     d = deletion(S, eta)
-    named, _ = d.search(np.zeros(12, dtype=bool), PRICE)
+    named = d.search(np.zeros(12, dtype=bool), PRICE)
     cost = {
         out: d.without(chosen(12, *out)).rest + PRICE * len(set(out))
         for out in [(i, j, k) for i in range(12) for j in range(i + 1) for k in range(j + 1)]
@@ -65,22 +66,56 @@ def test_search_finds_the_cheapest_of_all_choices() -> None:
 
 
 @pytest.mark.parametrize("start", [(), (0, 2, 4, 9)], ids=str)
-def test_search_tells_the_standing_of_what_it_chose(start: tuple[int, ...]) -> None:
+def test_search_ends_alike_wherever_it_starts(start: tuple[int, ...]) -> None:
     S, eta = correlated()
     eta[[1, 6, 7]] += 25.0, -40.0, 30.0
     d = deletion(S, eta)
-    named, found = d.search(chosen(12, *start), PRICE)
-    expected = deletion(S, eta).without(named)
+    named = d.search(chosen(12, *start), PRICE)
     assert set(np.flatnonzero(named)) == {1, 6, 7}
-    np.testing.assert_allclose(found.error, expected.error)
-    np.testing.assert_allclose(found.variance, expected.variance)
-    assert found.rest == pytest.approx(expected.rest)
+
+
+def test_accusation_is_the_standing_of_the_left_out_ones() -> None:
+    S, eta = correlated()
+    d = deletion(S, eta)
+    out = np.array([3, 7, 8])
+    error, variance = d.accusation(out)
+    expected = d.without(chosen(12, *out))
+    np.testing.assert_allclose(error, expected.error[out])
+    np.testing.assert_allclose(variance, expected.variance[out])
+
+
+def test_wrongly_accused_is_exchanged_for_the_wrong_one() -> None:
+    """A loose level is read by three; 0 is off by 30, but 1 is left out. No single move helps."""
+    S = np.full((3, 3), 400.0) + np.diag([1.0, 1.0, 26.0])
+    d, price = deletion(S, np.array([30.0, 0.0, 0.0])), 2.0 * PRICE
+    cost = [d.without(chosen(3, *out)).rest + price * len(out) for out in ((1,), (), (0, 1), (0,))]
+    assert cost[3] < cost[0] < min(cost[1:3])
+    assert tuple(np.flatnonzero(d.search(chosen(3, 1), price))) == (0,)
+
+
+def test_what_the_snapshot_says_is_least_squares_without_the_others() -> None:
+    """Each of three rows of ieee14, beside least squares on the rest with a weak prior."""
+    b = still("ieee14")
+    model = b.filter().model
+    x, rows = b.truth[0], np.arange(0, len(b.layout), 1)[3:]
+    rng = np.random.default_rng(SEED)
+    off = b.layout.sigma[rows] * rng.standard_normal(len(rows))
+    noise, among = b.layout.sigma[rows] ** 2, np.array([2, 11, 30])
+    found = of_snapshot(model, x, rows, off, noise, among).without(chosen(3, 0, 1, 2))
+    H = model.jacobian(x).toarray()[rows]
+    kept = np.delete(np.arange(len(rows)), among)
+    gain = H[kept].T @ (H[kept] / noise[kept, None]) + np.eye(H.shape[1])
+    moved = np.linalg.solve(gain, H[kept].T @ (off[kept] / noise[kept]))
+    for i, row in enumerate(among):
+        assert found.error[i] == pytest.approx(off[row] - H[row] @ moved, rel=1e-6)
+        alone = H[row] @ np.linalg.solve(gain, H[row])
+        assert found.variance[i] == pytest.approx(noise[row] + alone, rel=1e-6)
 
 
 def test_what_was_left_out_without_need_is_taken_back() -> None:
     S, eta = correlated()
     eta[4] += 40.0
-    named, _ = deletion(S, eta).search(chosen(12, 0, 2, 4, 9), PRICE)
+    named = deletion(S, eta).search(chosen(12, 0, 2, 4, 9), PRICE)
     assert tuple(np.flatnonzero(named)) == (4,)
 
 
@@ -90,7 +125,8 @@ def test_critical_measurement_is_never_left_out() -> None:
     z = np.array([0.0, 0.1, 50.0, 900.0])
     M = np.eye(4) - H @ np.linalg.solve(H.T @ H, H.T)
     d = Deletion(M @ z, np.diagonal(M), lambda rows: M[:, rows], float(z @ M @ z), np.full(4, 1e-9))
-    named, found = d.search(np.zeros(4, dtype=bool), PRICE)
+    named = d.search(np.zeros(4, dtype=bool), PRICE)
+    found = d.without(named)
     assert tuple(np.flatnonzero(named)) == (2,)
     assert found.variance[3] == np.inf
     assert found.ratio[3] == 0.0
@@ -99,5 +135,5 @@ def test_critical_measurement_is_never_left_out() -> None:
 def test_search_leaves_half_at_most() -> None:
     S = np.eye(6)
     eta = np.array([90.0, 80.0, 70.0, 60.0, 50.0, 0.0])
-    named, _ = deletion(S, eta).search(np.ones(6, dtype=bool), PRICE)
+    named = deletion(S, eta).search(np.ones(6, dtype=bool), PRICE)
     assert tuple(np.flatnonzero(named)) == (0, 1, 2)

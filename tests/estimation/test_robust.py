@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from pse_analysis.estimation.factors import Root
 from qu_bench import Bench, gross_errors, real_day, still
 
 from pse_analysis.errors import ParameterError
@@ -26,11 +27,14 @@ def suspicion(rng: np.random.Generator, m: int = 12, wrong: tuple[int, ...] = ()
     half = rng.standard_normal((m, 4))
     noise = rng.uniform(0.5, 1.5, m)
     S = half @ half.T + np.diag(noise)
-    chol = np.linalg.cholesky(S)
-    eta = chol @ rng.standard_normal(m)
+    eta = np.linalg.cholesky(S) @ rng.standard_normal(m)
     eta[list(wrong)] += 40.0
-    white = np.linalg.solve(chol, eta)
-    return Suspicion(eta, np.diagonal(S).copy(), noise, chol, float(white @ white))
+    return of(eta, S, noise)
+
+
+def of(eta: np.ndarray, S: np.ndarray, noise: np.ndarray) -> Suspicion:
+    chol = np.linalg.cholesky(S)
+    return Suspicion(eta, np.diagonal(S).copy(), noise, np.linalg.solve(chol, eta), Root(chol))
 
 
 def test_gate_lets_good_snapshots_pass_as_often_as_it_says() -> None:
@@ -69,12 +73,10 @@ def test_trace_is_raised_until_the_snapshot_passes() -> None:
         S = half @ half.T + np.diag(noise)
         eta = rng.standard_normal(m)
         eta[3] = 10.0 ** rng.uniform(0.9, 2.0) * np.sqrt(S[3, 3])
-        nis = float(eta @ np.linalg.solve(S, eta))
         first = phi = max(0.0, (eta @ eta - np.trace(S)) / noise.sum())
         while eta @ np.linalg.solve(S + phi * np.diag(noise), eta) > gate(m)[0]:
             phi = 4.0 * max(phi, 1.0)
-        found = Suspicion(eta, np.diagonal(S).copy(), noise, np.linalg.cholesky(S), nis)
-        np.testing.assert_allclose(robust.trace(found), phi)
+        np.testing.assert_allclose(robust.trace(of(eta, S, noise)), phi)
         raised += phi > first
     assert raised > 10
 
@@ -85,7 +87,7 @@ def test_wrong_channels_are_named_and_no_others() -> None:
         found = suspicion(rng, wrong=wrong)
         phi = robust.per_channel(found)
         assert tuple(np.flatnonzero(phi)) == wrong
-        S = found.chol_S @ found.chol_S.T + np.diag(phi * found.noise)
+        S = found.root.chol @ found.root.chol.T + np.diag(phi * found.noise)
         assert found.innovation @ np.linalg.solve(S, found.innovation) < gate(12)[0]
 
 
@@ -93,11 +95,9 @@ def test_error_that_the_forecasts_uncertainty_covers_is_found_by_the_other_chann
     """All channels see one uncertain level, of variance 100; one of them is 8σ off the others."""
     noise = np.ones(20)
     S = np.full((20, 20), 100.0) + np.diag(noise)
-    chol = np.linalg.cholesky(S)
     eta = np.full(20, 10.0)
     eta[4] += 8.0
-    white = np.linalg.solve(chol, eta)
-    found = Suspicion(eta, np.diagonal(S).copy(), noise, chol, float(white @ white))
+    found = of(eta, S, noise)
     assert eta[4] ** 2 < MARGIN * S[4, 4]
     assert tuple(np.flatnonzero(robust.per_channel(found))) == (4,)
 
@@ -105,12 +105,10 @@ def test_error_that_the_forecasts_uncertainty_covers_is_found_by_the_other_chann
 def test_suspects_that_the_other_channels_confirm_are_cleared() -> None:
     """The level is off by 4 of its 1; two channels lie a little beyond 3σ, a third one is wrong."""
     S = np.full((20, 20), 1.0) + np.eye(20)
-    chol = np.linalg.cholesky(S)
     eta = np.full(20, 4.0)
     eta[[2, 6]] = 4.5
     eta[11] = 40.0
-    white = np.linalg.solve(chol, eta)
-    found = Suspicion(eta, np.diagonal(S).copy(), np.ones(20), chol, float(white @ white))
+    found = of(eta, S, np.ones(20))
     assert (eta[[2, 6]] ** 2 > MARGIN * found.variance[[2, 6]]).all()
     assert tuple(np.flatnonzero(robust.per_channel(found))) == (11,)
 
@@ -213,7 +211,12 @@ def test_protected_trace_stays_near_with_gross_errors_at_every_instant(q: float)
     off = np.abs(done.x - b.truth)[:, : b.network.n_bus].max(axis=1)
     assert np.median(off) < 0.05
     assert np.quantile(off, 0.95) < 0.5
-    assert done.times(Status.RESTARTED) > 30
+    # After two snapshots that were refused as a whole, each channel is judged by itself.
+    refused = (done.field("inflation") > 0).mean(axis=1)
+    assert (refused == 1.0).mean() < 0.3
+    assert all(
+        "refused as a whole" in i.detail for i in done.info if 0 < (i.inflation > 0).mean() < 1
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -240,7 +243,7 @@ def test_filter_with_too_small_q_comes_back_after_a_real_step_of_load(robustness
         done = b.run(made, b.measure(rng))
         off = np.abs(done.x - b.truth).max(axis=1)
         assert off[30] > 0.3 * moved
-        assert off[35:].max() < 0.25 * moved
+        assert off[35:].max() < 0.35 * moved
         assert off[50:].max() < 0.04
         assert done.times(Status.RESTARTED) >= 1
 
@@ -274,7 +277,7 @@ def test_real_jump_is_refused_at_first_then_followed_and_said_so(robustness: str
     assert np.abs(alone.x[-1] - truth).max() > np.abs(protected.x[-1] - truth).max()
     assert protected.times(Status.RESTARTED) >= 1
     told = [i.detail for i in protected.info if i.status is Status.RESTARTED]
-    assert "refused 3 times in a row: the filter starts again from this snapshot" in told[0]
+    assert "refused 3 times in a row: the forecast was widened in their directions" in told[0]
     assert alone.times(Status.RESTARTED) == 0
 
 

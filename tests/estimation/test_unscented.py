@@ -106,7 +106,7 @@ def test_without_any_angle_the_slacks_angle_is_the_reference(kind: str) -> None:
     )
     assert (slack["value"] == 0.0).all()
     assert (slack["sigma"] == 0.0).all()
-    assert (result.steps["status"] == Status.OK).all()
+    assert result.steps["status"].isin([Status.OK, Status.INCONSISTENT]).all()
     assert np.abs(b.filter().model.columns - b.network.slack).min() > 0
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas
 
+from pse_analysis.estimation.factors import Root, cholesky, factor, solve, symmetric
 from pse_analysis.estimation.robust import Suspicion
 
 FloatArray = npt.NDArray[np.float64]
@@ -137,12 +138,15 @@ class Moments(NamedTuple):
         C, covariance of s and h(x).
     tuned : float
         What the observation remembers for the next step.
+    entry : (k,) ndarray of int, optional
+        Which entry of s each of the first k measurements reads.
     """
 
     mean: FloatArray
     own: FloatArray
     cross: FloatArray
     tuned: float = 0.0
+    entry: IntArray | None = None
 
     def condition(
         self, prior: Prior, innovation: FloatArray, noise: FloatArray, verdict: Verdict | None
@@ -152,100 +156,72 @@ class Moments(NamedTuple):
         Notes
         -----
         With S = L Lᵀ and X = C L⁻ᵀ: K η = X (L⁻¹η) and P - K S Kᵀ = P - X Xᵀ, a symmetric product.
+        Noise added to few rows F makes that P - X Xᵀ + Z Zᵀ, Z = X Y, see `_relaxation`.
         """
         variance = np.diagonal(self.own) + noise
-        chol_S = factor(self.own, variance)
-        white = solve(chol_S, innovation)
-        nis = float(white @ white)
+        solved = _Solved(self, factor(self.own, variance))
+        white = solve(solved.chol_S, innovation)
         inflation, relaxed = np.zeros(len(noise)), None
         if verdict is not None:
-            inflation = verdict(Suspicion(innovation, variance, noise, chol_S, nis))
+            root = Root(solved.chol_S, self._known(solved, prior, noise))
+            inflation = verdict(Suspicion(innovation, variance, noise, white, root))
         wrong = np.flatnonzero(inflation)
         if FEW * len(wrong) > len(noise):
-            chol_S = factor(self.own, variance + inflation * noise)
-            white = solve(chol_S, innovation)
-            nis = float(white @ white)
-        elif len(wrong):
-            relaxed = _relaxation(chol_S, wrong, (inflation * noise)[wrong])
-            through = relaxed @ white
-            white = white - relaxed.T @ through
+            solved = _Solved(self, factor(self.own, variance + inflation * noise))
+            white = solve(solved.chol_S, innovation)
+        nis = float(white @ white)
+        if 0 < FEW * len(wrong) <= len(noise):
+            relaxed = _relaxation(root.columns(wrong), (inflation * noise)[wrong])
+            through = white @ relaxed
+            white = white - relaxed @ through
             nis -= float(through @ through)
-        X = blas.dtrsm(1.0, chol_S, self.cross, side=1, lower=1, trans_a=1)
         # P is symmetric, so that its transpose is itself in the order that BLAS reads.
-        lower = blas.dsyrk(-1.0, X, beta=1.0, c=prior.P.T, lower=1)
+        lower = blas.dsyrk(-1.0, solved.X, beta=1.0, c=prior.P.T, lower=1)
         if relaxed is not None:
-            lower = blas.dsyrk(1.0, X @ relaxed.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
-        return Posterior(prior.s + X @ white, symmetric(lower), variance, inflation, nis)
+            lost = blas.dgemm(1.0, solved.X, relaxed)
+            lower = blas.dsyrk(1.0, lost, beta=1.0, c=lower, lower=1, overwrite_c=1)
+        return Posterior(prior.s + solved.X @ white, symmetric(lower), variance, inflation, nis)
+
+    def _known(
+        self, solved: _Solved, prior: Prior, noise: FloatArray
+    ) -> Callable[[], FloatArray] | None:
+        """Diagonal of S⁻¹ for measurements that read an entry of s.
+
+        With noise R of its own and the posterior variance P⁺ of what it reads it is (R - P⁺)/R².
+        """
+        entry = self.entry
+        if entry is None:
+            return None
+        own, before = noise[: len(entry)], np.diagonal(prior.P)
+
+        def known() -> FloatArray:
+            after = (before - np.einsum("ij,ij->i", solved.X, solved.X))[entry]
+            # Rounding must not take it beyond what it can be.
+            return np.asarray(np.clip((own - after) / own, own / (own + before[entry]), 1.0) / own)
+
+        return known
 
 
-def _relaxation(chol_S: FloatArray, rows: IntArray, added: FloatArray) -> FloatArray:
-    """Y of Lᵀ(S + U diag(a) Uᵀ)⁻¹L = I - YᵀY, for S = L Lᵀ and a few rows U of the identity.
+class _Solved:
+    """L of S = L Lᵀ, and X = C L⁻ᵀ once it is asked for."""
+
+    def __init__(self, moments: Moments, chol_S: FloatArray) -> None:
+        self.chol_S = chol_S
+        self._cross = moments.cross
+
+    @cached_property
+    def X(self) -> FloatArray:
+        return np.asarray(blas.dtrsm(1.0, self.chol_S, self._cross, side=1, lower=1, trans_a=1))
+
+
+def _relaxation(V: FloatArray, added: FloatArray) -> FloatArray:
+    """Y of Lᵀ(S + U diag(a) Uᵀ)⁻¹L = I - Y Yᵀ, for S = L Lᵀ, few rows U of the identity, V = L⁻¹U.
 
     It spares a second factorisation.
     """
-    unit = np.zeros((len(chol_S), len(rows)), order="F")
-    unit[rows, np.arange(len(rows))] = 1.0
-    V = solve(chol_S, unit)
-    core = V.T @ V
+    core = blas.dsyrk(1.0, V, trans=1, lower=1)
     core[np.diag_indices_from(core)] += 1.0 / added
-    return solve(cholesky(core), V.T)
-
-
-def cholesky(matrix: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of a covariance that rounding may have made a little indefinite.
-
-    Above the diagonal the result is zero. If the factorisation fails, the diagonal is raised by the
-    smallest of 1e-14, 1e-12, … 1e-6 of itself that mends it.
-
-    Parameters
-    ----------
-    matrix : (n, n) ndarray
-        Symmetric.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If not even that helps.
-    """
-    # Its transpose is itself, in the order that LAPACK reads.
-    found, failed = lapack.dpotrf(matrix.T, lower=1, clean=1)
-    for power in (-14, -12, -10, -8, -6):
-        if not failed:
-            return np.asarray(found)
-        raised = matrix + np.diag(10.0**power * np.diagonal(matrix))
-        found, failed = lapack.dpotrf(raised.T, lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("covariance is not positive definite")
-    return np.asarray(found)
-
-
-def factor(own: FloatArray, diagonal: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of an innovation's covariance, with another diagonal in its place.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If it is not positive definite.
-    """
-    S = own.copy(order="F")
-    S.reshape(-1, order="A")[:: len(S) + 1] = diagonal
-    found, failed = lapack.dpotrf(S, lower=1, clean=0, overwrite_a=1)
-    if failed:
-        raise np.linalg.LinAlgError("the innovation's covariance is not positive definite")
-    return np.asarray(found)
-
-
-def solve(chol: FloatArray, right: FloatArray) -> FloatArray:
-    """L⁻¹ times one or many vectors, for a lower triangular L."""
-    found, _ = lapack.dtrtrs(chol, right, lower=1)
-    return np.asarray(found)
-
-
-def symmetric(lower: FloatArray) -> FloatArray:
-    """The symmetric matrix of a lower triangle."""
-    out = lower.copy(order="C")
-    np.copyto(out, lower.T, where=_above(len(lower)))
-    return out
+    return np.asarray(blas.dtrsm(1.0, cholesky(core.T), V, side=1, lower=1, trans_a=1))
 
 
 def block(rows: Rows, columns: Rows) -> tuple[Rows, Rows]:
@@ -253,9 +229,3 @@ def block(rows: Rows, columns: Rows) -> tuple[Rows, Rows]:
     if isinstance(rows, slice) or isinstance(columns, slice):
         return rows, columns
     return rows[:, None], columns[None, :]
-
-
-@cache
-def _above(n: int) -> BoolArray:
-    """Where a matrix of n rows is above its diagonal."""
-    return np.triu(np.ones((n, n), dtype=np.bool_), 1)

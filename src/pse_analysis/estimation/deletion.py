@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
+
+from pse_analysis.estimation.factors import Columns
+from pse_analysis.measurement import MeasurementModel
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -25,6 +27,8 @@ FORGOTTEN = 1.0
 """σ of a voltage of which nothing is known but its rating. [p.u., rad]"""
 LARGEST_SHARE = 0.5
 """Share of the measurements that may be left out; beyond it there is no telling who is wrong."""
+SLIGHT = 1e-9
+"""Share of a precision by which its diagonal is raised where rounding made it indefinite."""
 
 
 class Standing(NamedTuple):
@@ -59,7 +63,7 @@ class Deletion:
     diagonal : (m,) ndarray
         Of M.
     columns : (k,) ndarray of int -> (m, k) ndarray
-        Columns of M; each is asked for once.
+        Columns of M.
     total : float
         ηᵀ M η.
     floor : (m,) ndarray, optional
@@ -77,29 +81,27 @@ class Deletion:
     ) -> None:
         self._weighted, self._diagonal, self._total = weighted, diagonal, total
         self._floor = 1e-12 * diagonal if floor is None else floor
-        self._ask = columns
-        self._place = np.full(len(weighted), -1)
-        self._known = np.empty((len(weighted), 0))
-
-    def _columns(self, out: IntArray) -> FloatArray:
-        new = out[self._place[out] < 0]
-        if len(new):
-            self._place[new] = self._known.shape[1] + np.arange(len(new))
-            self._known = np.hstack([self._known, self._ask(new)])
-        return self._known[:, self._place[out]]
+        self._columns = columns
 
     def without(self, left_out: BoolArray) -> Standing:
         """Standing of every measurement when some are left out. (m,)"""
-        return self._swept(left_out).standing(self._floor)
-
-    def _swept(self, left_out: BoolArray) -> _Swept:
         out = np.flatnonzero(left_out)
-        return _Swept(self._weighted, self._diagonal, self._total, out, self._columns(out))
+        rest = self._rest(out)
+        known = rest.diagonal > self._floor
+        known[out] = False
+        error, variance = np.zeros(len(known)), np.full(len(known), np.inf)
+        np.divide(rest.weighted, rest.diagonal, out=error, where=known)
+        np.divide(1.0, rest.diagonal, out=variance, where=known)
+        error[out], variance[out] = self.accusation(out)
+        return Standing(error, variance, self._total - float(self._weighted[out] @ error[out]))
 
-    def search(
-        self, start: BoolArray, price: float, most: float = LARGEST_SHARE
-    ) -> tuple[BoolArray, Standing]:
-        """Leave out and take back, one at a time, what helps most.
+    def accusation(self, out: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Error and variance of measurements that are left out together. (k,), (k,)"""
+        own = _inverse(self._columns(out)[out])
+        return own @ self._weighted[out], np.diagonal(own).copy()
+
+    def search(self, start: BoolArray, price: float, most: float = LARGEST_SHARE) -> BoolArray:
+        """Leave out, take back and exchange, one at a time, what helps most.
 
         Parameters
         ----------
@@ -114,136 +116,172 @@ class Deletion:
 
         Returns
         -------
-        left_out : (m,) ndarray of bool
-        standing : Standing
+        (m,) ndarray of bool
+            Left out.
 
         Notes
         -----
         Descends ηᵀMη of the kept ones + price × number left out, the likelihood of errors of any
-        size that are rare, until no single move helps.
+        size that are rare, until no move helps: what need not be left out is taken back, then what
+        is worth it is left out, by turns, and at the end one is left out in another one's place,
+        where they see nearly the same and the wrong one was accused first.
         """
-        out = start.copy()
-        if out.sum() > most * len(out):
-            out[:] = False
-        swept, moves = self._swept(out), 0
-        while True:
-            ratio = swept.ratio(self._floor)
-            gain = np.where(out, price - ratio, ratio - price)
-            if out.sum() >= most * len(out):
-                gain[~out] = -np.inf
-            row = int(gain.argmax())
+        limit = most * len(start)
+        out = np.flatnonzero(start)
+        if len(out) > limit:
+            out = out[:0]
+        out = self._settled(out, price)
+        while len(out) < len(start):
+            more, rest = self._extended(out, price, limit)
+            out = self._settled(more, price)
+            if len(out) == len(more):
+                other = self._exchanged(out, rest, price)
+                if other is None:
+                    break
+                out = self._settled(other, price)
+        left_out = np.zeros(len(start), dtype=np.bool_)
+        left_out[out] = True
+        return left_out
+
+    def _rest(self, out: IntArray) -> _Rest:
+        return _Rest(self._weighted, self._diagonal, out, self._columns(out))
+
+    def _settled(self, out: IntArray, price: float) -> IntArray:
+        """What stays left out of some measurements, when the others are taken back by turns."""
+        own = _inverse(self._columns(out)[out])
+        error = own @ self._weighted[out]
+        stay = np.ones(len(out), dtype=np.bool_)
+        while stay.any():
+            ratio = np.divide(error**2, np.diagonal(own), where=stay, out=np.full(len(out), np.inf))
+            row = int(ratio.argmin())
             # What rounding makes of a tie must not be moved to and fro.
-            if gain[row] <= 1e-9 * price:
-                # Anew, so that no rounding of the moves is left in what is told.
-                return out, self.without(out) if moves else swept.standing(self._floor)
-            if out[row]:
-                swept.take_back(row)
-            else:
-                swept.leave_out(row, self._columns(np.array([row]))[:, 0])
-            out[row] = not out[row]
-            moves += 1
+            if ratio[row] >= (1.0 - SLIGHT) * price:
+                break
+            stay[row] = False
+            share = own[row] / own[row, row]
+            error -= error[row] * share
+            own -= np.outer(own[row], share)
+        return out[stay]
+
+    def _extended(self, out: IntArray, price: float, limit: float) -> tuple[IntArray, _Rest]:
+        """Those measurements and all others that are worth leaving out, the worst ones first."""
+        rest = self._rest(out)
+        while len(out) < limit:
+            ratio = rest.ratio(out, self._floor)
+            row = int(ratio.argmax())
+            if ratio[row] <= price:
+                break
+            out = np.append(out, row)
+            rest.leave_out(row, self._columns(out[-1:])[:, 0])
+        return out, rest
+
+    def _exchanged(self, out: IntArray, rest: _Rest, price: float) -> IntArray | None:
+        """Those measurements with one in another one's place, or None if no exchange helps.
+
+        With i taken back, b_i²/N_ii is added, N = (M_FF)⁻¹, and j is worth
+        (w_j + a_ji b_i/N_ii)²/(d_j + a_ji²/N_ii) with a = M_:F N.
+        """
+        if not len(out):
+            return None
+        across = self._columns(out)
+        inverse = _inverse(across[out])
+        own, error = np.diagonal(inverse), inverse @ self._weighted[out]
+        seen = np.flatnonzero(rest.diagonal > self._floor)
+        swept = across[seen] @ (inverse / np.sqrt(own))
+        worth = (rest.weighted[seen, None] + swept * (error / np.sqrt(own))) ** 2
+        gain = worth / (rest.diagonal[seen, None] + swept**2) - error**2 / own
+        gain[np.isin(seen, out)] = -np.inf
+        j, i = np.unravel_index(gain.argmax(), gain.shape)
+        if gain[j, i] <= SLIGHT * price:
+            return None
+        other = out.copy()
+        other[i] = seen[j]
+        return other
 
 
-class _Swept:
-    """A symmetric sweep of M, bordered by Mη and ηᵀMη, over the rows that are left out.
+class _Rest:
+    """Mη and the diagonal of M for the kept ones, when some measurements F are left out.
 
-    Between kept rows stands what is left of M, between left-out ones -(M_FF)⁻¹, and in the columns
-    of these what the kept ones make of them; so one more or one less is an update of rank one.
+    Their M is M - Z Zᵀ, Z = M_:F L⁻ᵀ with M_FF = L Lᵀ; one more to leave out is one more column.
 
     Parameters
     ----------
     weighted, diagonal : (m,) ndarray
-    rest : float
+        Of all.
     out : (k,) ndarray of int
+        F.
     across : (m, k) ndarray
-        Columns of M.
+        M_:F.
     """
 
     def __init__(
-        self,
-        weighted: FloatArray,
-        diagonal: FloatArray,
-        rest: float,
-        out: IntArray,
-        across: FloatArray,
+        self, weighted: FloatArray, diagonal: FloatArray, out: IntArray, across: FloatArray
     ) -> None:
-        own = np.linalg.inv(across[out])
-        error = own @ weighted[out]
-        self._out, self._across = out, across
-        self._swept = across @ own
-        self._weighted = weighted - across @ error
-        self._diagonal = diagonal - np.einsum("ij,ij->i", self._swept, across)
-        self._rest = rest - float(weighted[out] @ error)
-        self._swept[out], self._weighted[out], self._diagonal[out] = -own, error, -np.diagonal(own)
+        self.weighted, self.diagonal, self._half = weighted, diagonal, across
+        if len(out):
+            factor = _factor(across[out])
+            half = blas.dtrsm(1.0, factor, across, side=1, lower=1, trans_a=1)
+            self.weighted = weighted - half @ blas.dtrsv(factor, weighted[out], lower=1)
+            self.diagonal = diagonal - np.einsum("ij,ij->i", half, half)
+            self._half = half
 
     def leave_out(self, row: int, column: FloatArray) -> None:
-        """Leave a kept row out, given its column of M."""
-        swept = column - self._across @ self._swept[row]
-        swept[self._out] = self._swept[row]
-        pivot = self._pivot(row, swept)
-        new = swept / pivot
-        new[row] = -1.0 / pivot
-        self._out = np.append(self._out, row)
-        self._across = np.column_stack([self._across, column])
-        self._swept = np.column_stack([self._swept, new])
+        """Leave one more out, given its column of M."""
+        new = column - self._half @ self._half[row]
+        new /= np.sqrt(new[row])
+        self.weighted = self.weighted - (self.weighted[row] / new[row]) * new
+        self.diagonal = self.diagonal - new**2
+        self._half = np.column_stack([self._half, new])
 
-    def take_back(self, row: int) -> None:
-        """Keep a left-out row again."""
-        others = self._out != row
-        swept = self._swept[:, np.flatnonzero(~others)[0]]
-        self._out = self._out[others]
-        self._across, self._swept = self._across[:, others], self._swept[:, others]
-        self._pivot(row, swept)
+    def ratio(self, out: IntArray, floor: FloatArray) -> FloatArray:
+        """`Standing.ratio` of the kept ones, zero for the left-out and critical ones."""
+        ratio = self.weighted**2 / np.maximum(self.diagonal, floor)
+        ratio[out] = 0.0
+        ratio[self.diagonal <= floor] = 0.0
+        return np.asarray(ratio)
 
-    def _pivot(self, row: int, swept: FloatArray) -> float:
-        pivot, weighted = float(swept[row]), float(self._weighted[row])
-        across = swept[self._out] / pivot
-        self._swept = self._swept - np.outer(swept, across)
-        self._weighted = self._weighted - (weighted / pivot) * swept
-        self._diagonal = self._diagonal - swept**2 / pivot
-        self._rest -= weighted**2 / pivot
-        sign = np.sign(pivot)
-        self._swept[row], self._weighted[row] = sign * across, weighted / abs(pivot)
-        self._diagonal[row] = -1.0 / pivot
-        return pivot
 
-    def ratio(self, floor: FloatArray) -> FloatArray:
-        """`Standing.ratio` of every row, which is all that a search looks at."""
-        unseen = self._diagonal <= floor
-        unseen[self._out] = False
-        return np.where(unseen, 0.0, self._weighted**2) / np.where(
-            unseen, 1.0, np.abs(self._diagonal)
-        )
+def _factor(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of a small precision."""
+    factor, failed = lapack.dpotrf(matrix, lower=1)
+    if failed:
+        factor, failed = lapack.dpotrf(matrix + np.diag(SLIGHT * np.diagonal(matrix)), lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("a precision is not positive definite")
+    return np.asarray(factor)
 
-    def standing(self, floor: FloatArray) -> Standing:
-        """Of every row; kept ones with less than the floor are seen by nothing else."""
-        known = self._diagonal > floor
-        known[self._out] = False
-        error, variance = np.zeros_like(floor), np.full_like(floor, np.inf)
-        error[known] = self._weighted[known] / self._diagonal[known]
-        variance[known] = 1.0 / self._diagonal[known]
-        error[self._out], variance[self._out] = (
-            self._weighted[self._out],
-            -self._diagonal[self._out],
-        )
-        return Standing(error, variance, self._rest)
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a small precision."""
+    if not len(matrix):
+        return matrix
+    lower, _ = lapack.dpotri(_factor(matrix), lower=1, overwrite_c=1)
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
 def of_snapshot(
-    H: sparse.csr_array, deviation: FloatArray, noise: FloatArray, among: IntArray
+    model: MeasurementModel,
+    x: FloatArray,
+    rows: IntArray,
+    deviation: FloatArray,
+    noise: FloatArray,
+    among: IntArray,
 ) -> Deletion:
     """What the measurements of one snapshot say about some of them, without any forecast.
 
     Parameters
     ----------
-    H : (m, n) sparse array
-        ∂h/∂x.
-    deviation : (m,) ndarray
-        z - h(x).
-    noise : (m,) ndarray
-        Diagonal of R.
+    model : MeasurementModel
+    x : (2N,) ndarray
+        [θ; |V|] about which h is linear.
+    rows : (r,) ndarray of int
+        Rows of the layout that report.
+    deviation : (r,) ndarray
+        Their z - h(x).
+    noise : (r,) ndarray
+        Their part of the diagonal of R.
     among : (k,) ndarray of int
-        Rows that may be left out; the others are kept.
+        Places among these rows that may be left out; the others are kept.
 
     Returns
     -------
@@ -251,24 +289,32 @@ def of_snapshot(
         Of the k rows. Its M = R⁻¹ - R⁻¹H G⁻¹HᵀR⁻¹ knows each voltage to `FORGOTTEN` around x, which
         keeps G regular whatever is left out, and says next to nothing.
     """
-    root = 1.0 / np.sqrt(noise)
-    weights = np.repeat(root, np.diff(H.indptr))
-    whitened = sparse.csr_array((weights * H.data, H.indices, H.indptr), shape=H.shape)
-    gain = (whitened.T @ whitened).toarray()
-    gain[np.diag_indices_from(gain)] += FORGOTTEN**-2
+    m, n = model.shape
+    root, white = np.zeros(m), np.zeros(m)
+    root[rows] = 1.0 / np.sqrt(noise)
+    white[rows] = root[rows] * deviation
+    whitened = model.jacobian_data(x) * root[model.row_of_entry]
+    gain = model.gram(whitened)
+    gain.reshape(-1, order="A")[:: n + 1] += FORGOTTEN**-2
     # Dense from here: sparse factors cost more in their making for a few hundred rows.
-    factor, _ = lapack.dpotrf(gain.T, lower=1, clean=0, overwrite_a=1)
-    dense = whitened.toarray()
-    own, scale = dense[among], root[among]
+    factor, _ = lapack.dpotrf(gain, lower=1, clean=0, overwrite_a=1)
+    place = np.full(m, -1)
+    place[rows[among]] = np.arange(len(among))
+    at = place[model.row_of_entry]
+    chosen = np.flatnonzero(at >= 0)
+    own = np.zeros((len(among), n))
+    own[at[chosen], model.indices[chosen]] = whitened[chosen]
     half, _ = lapack.dtrtrs(factor, own.T, lower=1)
-    white = root * deviation
-    moved, _ = lapack.dpotrs(factor, white @ dense, lower=1)
+    gradient = np.bincount(model.indices, whitened * white[model.row_of_entry], n)
+    moved, _ = lapack.dpotrs(factor, gradient, lower=1)
+    scale = root[rows[among]]
 
-    def columns(rows: IntArray) -> FloatArray:
-        out = -(half.T @ half[:, rows])
-        out[rows, np.arange(len(rows))] += 1.0
-        return np.asarray(scale[:, None] * out * scale[rows])
+    def column(asked: IntArray) -> FloatArray:
+        out = -(half.T @ half[:, asked])
+        # Nothing is known so well that rounding could tell it from exact.
+        out[asked, np.arange(len(asked))] += 1.0 + SLIGHT
+        return np.asarray(scale[:, None] * out * scale[asked])
 
-    said = scale * (white[among] - own @ moved)
+    said = scale * (white[rows[among]] - own @ moved)
     diagonal = scale**2 * (1.0 - np.einsum("ij,ij->j", half, half))
-    return Deletion(said, diagonal, columns, float(deviation[among] @ said))
+    return Deletion(said, diagonal, Columns(len(among), column), float(deviation[among] @ said))

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.conditioning import Moments, Prior
 from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.gaussian import Observation
+from pse_analysis.estimation.update import Observation
 from pse_analysis.measurement import MeasurementModel, wrap
 
 FloatArray = npt.NDArray[np.float64]

@@ -6,52 +6,30 @@ innovation, condition. What is composed: process × observation × noise × robu
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from pse_analysis.estimation import robust
-from pse_analysis.estimation.conditioning import Posterior, Predicted, Prior
+from pse_analysis.estimation.conditioning import Prior
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.holt import Process
 from pse_analysis.estimation.noise import Learnt, Noise
-from pse_analysis.estimation.robust import Judge, Protection, Suspicion
+from pse_analysis.estimation.recovery import Recovery
+from pse_analysis.estimation.robust import Judge, Protection
 from pse_analysis.estimation.square_root import carried
 from pse_analysis.estimation.start import begin
-from pse_analysis.estimation.wls import WeightedLeastSquares, WlsSolution
+from pse_analysis.estimation.update import Observation, Update, update
+from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import MeasurementModel, SensorLayout, wrap
+from pse_analysis.measurement import VA, VM, MeasurementModel, SensorLayout
 from pse_analysis.vocabulary import Status
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
-
-
-Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Predicted]
-"""(prior, snapshot, rows, tuned, s) -> prediction of the rows, linearised at s where it matters."""
-
-
-class Observation(NamedTuple):
-    """How the measurements are predicted.
-
-    Attributes
-    ----------
-    predict : Observe
-    tuned : float
-        Memory at the start.
-    passes : int
-        How often the prediction is renewed at the estimate that it led to; 1: never.
-    """
-
-    predict: Observe
-    tuned: float = 0.0
-    passes: int = 1
 
 
 @dataclass(frozen=True)
@@ -87,6 +65,8 @@ class GaussianState:
         Memory of the observation.
     refusals : (m,) ndarray of int
         Consecutive refusals of each channel.
+    whole : int
+        Consecutive snapshots that were refused as a whole.
     chol_P : (N, N) ndarray, optional
         Root of P, where it is carried beside it.
     """
@@ -98,19 +78,8 @@ class GaussianState:
     noise: Any
     tuned: float
     refusals: IntArray
+    whole: int = 0
     chol_P: FloatArray | None = None
-
-
-class _Update(NamedTuple):
-    found: Posterior
-    innovation: FloatArray
-    tuned: float
-    iterations: int
-    converged: bool
-
-
-TOLERANCE = 1e-6
-"""Largest move of a voltage in the last pass of an iterated filter. [rad, p.u.]"""
 
 
 class GaussianFilter:
@@ -139,6 +108,11 @@ class GaussianFilter:
         self.observation = observation
         self.noise = noise
         self.robustness = robustness or Robustness()
+        # Voltages come first: what is linear in the state needs no inverse to be judged.
+        voltage = np.isin(model.layout.quantity, (VM, VA))
+        self._order = np.concatenate([np.flatnonzero(voltage), np.flatnonzero(~voltage)])
+        protection = self.robustness.protection
+        self._recovery = None if protection is None else Recovery(model, protection)
 
     def begin(self, x: FloatArray, P: FloatArray, time: np.datetime64) -> GaussianState:
         """State from an estimate of [θ; |V|] (2N,) with covariance P (n, n) of the columns."""
@@ -176,37 +150,31 @@ class GaussianFilter:
             return replace(state, s=s, P=prior.P, x=x, process=process, chol_P=root), Info.nothing(
                 m, Status.PREDICTED
             )
-        rows = np.flatnonzero(used)
+        rows = self._order[used[self._order]]
+        judge, status, detail = self.robustness.judge, Status.OK, ""
+        if self._recovery is not None and state.whole >= self._recovery.protection.patience - 1:
+            judge = robust.per_channel
+            detail = "snapshots were refused as a whole before: each channel is judged by itself"
         try:
-            update = self._update(prior, snapshot, rows, state.tuned, self.robustness.judge)
-            refusals = np.zeros(m, dtype=np.int64)
-            # What contradicts and was believed all the same was not understood either.
-            refused = (update.found.inflation > 0) | (update.found.nis > robust.gate(len(rows))[0])
-            refusals[rows] = np.where(refused, state.refusals[rows] + 1, 0)
-            status, detail = Status.OK, ""
-            protection = self.robustness.protection
-            if protection is not None and protection.latched(refusals, used):
-                cause = protection.cause(refusals[rows])
-                alone, told = begin(self._alone, snapshot)
-                if alone is None:
-                    update, refusals, status, detail = self._widen(
-                        prior, snapshot, rows, state.tuned, update, refusals, protection
-                    )
-                elif 2 * np.count_nonzero(told.findings[rows]) <= np.count_nonzero(refused):
-                    return self._restarted(state, snapshot, rows, update, alone, told, cause)
-                else:
-                    # Wrong meters stay wrong whatever the forecast says; ask again after a while.
-                    refusals[:] = 0
-                    detail = "the snapshot alone refuses most of them as well"
-                detail = f"{cause}: {detail}"
+            done = update(self.model, self.observation, prior, snapshot, rows, state.tuned, judge)
+            refusals, whole = self._refused(state, done, rows, judge)
+            if self._recovery is not None and self._recovery.protection.latched(refusals, used):
+                restart, detail = self._recovery.find(prior, snapshot, rows, done, refusals[rows])
+                if restart is not None:
+                    again = self.begin(restart.x, restart.P, snapshot.time)
+                    # What was learnt about the noise is kept.
+                    again = replace(again, noise=state.noise, tuned=done.tuned, whole=whole)
+                    return again, restart.told.info(Status.RESTARTED, snapshot, rows, detail)
+                # Wrong meters stay wrong whatever the forecast says; ask again after a while.
+                refusals[:] = 0
         except np.linalg.LinAlgError as error:
             return None, Info.nothing(
                 m, Status.DIVERGED, f"{error}: the filter starts again from least squares"
             )
-        if not update.converged:
+        if not done.converged:
             status = Status.NOT_CONVERGED
-            detail = f"still moving after {update.iterations} passes; more noise would slow it less"
-        found = update.found
+            detail = f"still moving after {done.iterations} passes; more noise would slow it less"
+        found = done.found
         learnt = Learnt(found.s - affine, found.s - s, found.P, forecast)
         after = GaussianState(
             found.s,
@@ -214,117 +182,28 @@ class GaussianFilter:
             prior.filled(found.s),
             process,
             self.noise.learn(noise, learnt),
-            update.tuned,
+            done.tuned,
             refusals,
+            whole,
             found.chol_P,
         )
-        full = np.full((2, m), np.nan)
-        inflation = np.zeros(m)
-        full[0, rows], full[1, rows] = update.innovation, np.sqrt(found.variance)
-        inflation[rows] = found.inflation
-        return after, Info(
-            status,
-            update.iterations,
-            found.nis,
-            len(rows),
-            used,
-            full[0],
-            full[1],
-            inflation,
-            detail,
-        )
+        return after, done.told.info(status, snapshot, rows, detail)
 
-    def _update(
-        self, prior: Prior, snapshot: Snapshot, rows: IntArray, tuned: float, judge: Judge
-    ) -> _Update:
-        R = snapshot.sigma[rows] ** 2
-        angular = self.model.angular[rows]
-        at = prior.s
-        converged = False
-        verdict = None
-        if judge is not robust.none:
-            verdict = partial(_with_slopes, judge, lambda: self.model.jacobian(prior.x)[rows])
-        for passes in range(1, self.observation.passes + 1):  # noqa: B007 (reported below)
-            predicted = self.observation.predict(prior, snapshot, rows, tuned, at)
-            eta = snapshot.z[rows] - predicted.mean
-            eta[angular] = wrap(eta[angular])
-            found = predicted.condition(prior, eta, R, verdict)
-            moved = np.abs(found.s - at).max()
-            at, tuned = found.s, predicted.tuned
-            if moved < TOLERANCE:
-                converged = True
-                break
-        return _Update(found, eta, tuned, passes, converged or self.observation.passes == 1)
-
-    @cached_property
-    def _alone(self) -> WeightedLeastSquares:
-        return WeightedLeastSquares(self.model.network, self.model.layout)
-
-    def _restarted(
-        self,
-        state: GaussianState,
-        snapshot: Snapshot,
-        rows: IntArray,
-        update: _Update,
-        alone: WlsSolution,
-        told: Info,
-        cause: str,
-    ) -> tuple[GaussianState, Info]:
-        """Start again from the snapshot alone; what was learnt about the noise is kept."""
-        columns = self.model.columns
-        again = self.begin(alone.x, alone.covariance()[np.ix_(columns, columns)], snapshot.time)
-        left_out = told.findings.astype(bool)
-        m = len(left_out)
-        innovation, deviation = np.full(m, np.nan), np.full(m, np.nan)
-        innovation[rows], deviation[rows] = update.innovation, np.sqrt(update.found.variance)
-        refusals = self._refused_again(rows, m)
-        kept = int(told.used.sum())
-        info = Info(
-            Status.RESTARTED,
-            alone.iterations,
-            alone.objective,
-            max(kept - len(columns), 0),
-            snapshot.available & snapshot.fresh,
-            innovation,
-            deviation,
-            # As if each of them were off by no more than its noise.
-            np.where(left_out, (alone.residual / snapshot.sigma) ** 2, 0.0),
-            f"{cause}: the filter starts again from this snapshot alone",
-        )
-        return replace(again, noise=state.noise, tuned=update.tuned, refusals=refusals), info
-
-    def _refused_again(self, rows: IntArray, m: int) -> IntArray:
-        """Refusals after a way out: a judge of whole snapshots is not given many more to lose."""
-        refusals = np.zeros(m, dtype=np.int64)
-        protection = self.robustness.protection
-        if protection is not None and self.robustness.judge is not robust.per_channel:
-            refusals[rows] = protection.patience - 1
-        return refusals
-
-    def _widen(
-        self,
-        prior: Prior,
-        snapshot: Snapshot,
-        rows: IntArray,
-        tuned: float,
-        update: _Update,
-        refusals: IntArray,
-        protection: Protection,
-    ) -> tuple[_Update, IntArray, Status, str]:
-        """Widen the forecast where a snapshot alone is not enough, and judge by channel.
-
-        Kept if it clears half of the refused channels.
-        """
-        P = prior.P.copy()
-        voltages = np.arange(prior.n)
-        P[voltages, voltages] += protection.widening(refusals[rows])
-        widened = self._update(
-            replace(prior, P=P, carried=None), snapshot, rows, tuned, robust.per_channel
-        )
-        if 2 * np.count_nonzero(widened.found.inflation) > np.count_nonzero(update.found.inflation):
-            return update, refusals, Status.OK, "a wider forecast does not clear them"
-        again = self._refused_again(rows, len(refusals))
-        return widened, again, Status.RESTARTED, "the forecast was widened, which cleared most"
+    def _refused(
+        self, state: GaussianState, done: Update, rows: IntArray, judge: Judge
+    ) -> tuple[IntArray, int]:
+        """How often in a row each channel, and snapshots as a whole, were refused."""
+        found = done.found
+        open_gate = found.nis > robust.gate(len(rows))[0]
+        if judge is robust.trace:
+            refused = done.innovation**2 > robust.MARGIN * found.variance
+        else:
+            # What contradicts and was believed all the same was not understood either.
+            refused = (found.inflation > 0) | open_gate
+        refusals = np.zeros(len(state.refusals), dtype=np.int64)
+        refusals[rows] = np.where(refused, state.refusals[rows] + 1, 0)
+        whole = self.robustness.judge is robust.trace and (open_gate or found.inflation.any())
+        return refusals, state.whole + 1 if whole else 0
 
 
 def _through(transition: FloatArray, root: FloatArray) -> FloatArray:
@@ -333,12 +212,6 @@ def _through(transition: FloatArray, root: FloatArray) -> FloatArray:
         return float(transition[0, 0]) * root
     blocks = root.reshape(len(transition), -1, root.shape[1])
     return np.asarray(np.einsum("ij,jnk->ink", transition, blocks).reshape(root.shape))
-
-
-def _with_slopes(
-    judge: Judge, slopes: Callable[[], sparse.csr_array], found: Suspicion
-) -> FloatArray:
-    return judge(replace(found, slopes=slopes))
 
 
 def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianFilter) -> Estimator:

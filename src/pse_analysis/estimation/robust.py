@@ -14,11 +14,12 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse, stats
-from scipy.linalg import blas, lapack
+from scipy import stats
+from scipy.linalg import blas
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.deletion import Deletion, of_snapshot
+from pse_analysis.estimation.deletion import Deletion
+from pse_analysis.estimation.factors import Root
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -30,6 +31,12 @@ RAISE, MOST_RAISES = 4.0, 20
 """Factor by which φ is raised, and how often at most."""
 MARGIN = 9.0
 """g: squared deviation, in units of its variance, up to which a channel is fully believed."""
+COMPANY = 2
+"""Fewest accused channels that a wrong forecast is believed to have misled.
+
+A movement is seen by several channels. A lone one that the forecast contradicts and few others
+confirm is as often wrong, together with one of these.
+"""
 FAR = 6.0
 """Deviation from the forecast, in units of √S_ii, from which the search for wrong channels starts.
 """
@@ -47,20 +54,25 @@ class Suspicion:
         S_ii.
     noise : (m,) ndarray
         R_ii.
-    chol_S : (m, m) ndarray
-        Lower Cholesky factor of S; what stands above the diagonal does not count.
-    nis : float
-        ηᵀS⁻¹η.
-    slopes : callable, optional
-        Gives ∂h/∂x at the forecast, (m, n); a judge that has it can ask the snapshot alone.
+    white : (m,) ndarray
+        L⁻¹η, S = L Lᵀ.
+    root : Root
+        L.
+    alone : (j,) ndarray of int -> Deletion, optional
+        What the snapshot without the forecast says about some measurements.
     """
 
     innovation: FloatArray
     variance: FloatArray
     noise: FloatArray
-    chol_S: FloatArray
-    nis: float
-    slopes: Callable[[], sparse.csr_array] | None = None
+    white: FloatArray
+    root: Root
+    alone: Callable[[IntArray], Deletion] | None = None
+
+    @property
+    def nis(self) -> float:
+        """ηᵀS⁻¹η."""
+        return float(self.white @ self.white)
 
 
 Judge = Callable[[Suspicion], FloatArray]
@@ -121,8 +133,8 @@ def _passes(found: Suspicion, phi: float, bound: float) -> bool:
     step = left / scale
     size = float(left @ step)
     for _ in range(len(left)):
-        through = blas.dtrmv(found.chol_S, step, lower=1, trans=1)
-        image = blas.dtrmv(found.chol_S, through, lower=1) + phi * found.noise * step
+        through = blas.dtrmv(found.root.chol, step, lower=1, trans=1)
+        image = blas.dtrmv(found.root.chol, through, lower=1) + phi * found.noise * step
         length = size / float(step @ image)
         value += length * size
         left = left - length * image
@@ -156,36 +168,34 @@ def per_channel(found: Suspicion) -> FloatArray:
     total, largest = gate(len(eta))
     if found.nis <= total and (eta**2 <= largest * found.variance).all():
         return np.zeros(len(eta))
-    # Of S⁻¹ only the diagonal and a few columns are asked for: L⁻¹ is enough.
-    inverse, _ = lapack.dtrtri(np.triu(found.chol_S.T).T, lower=1, overwrite_c=1)
-    weighted, _ = lapack.dpotrs(found.chol_S, eta, lower=1)
-    deletion = Deletion(
-        weighted,
-        np.einsum("ij,ij->j", inverse, inverse),
-        lambda rows: inverse.T @ inverse[:, rows],
-        found.nis,
-    )
-    named, standing = deletion.search(eta**2 > FAR**2 * found.variance, largest)
-    if named.any() and found.slopes is not None:
-        acquitted = _acquitted(
-            found, found.slopes(), np.flatnonzero(named), standing.error, largest
-        )
-        if len(acquitted):
-            named[acquitted] = False
-            standing = deletion.without(named)
-    excess = np.maximum(standing.error**2 - MARGIN * standing.variance, 0.0)
-    return np.where(named, np.divide(excess, noise, where=named, out=np.zeros_like(noise)), 0.0)
+    # Of S⁻¹ only the diagonal and a few columns are asked for.
+    weighted = blas.dtrsv(found.root.chol, found.white, lower=1, trans=1)
+    deletion = Deletion(weighted, found.root.precision(), found.root.precision_columns, found.nis)
+    named = np.flatnonzero(deletion.search(eta**2 > MARGIN * found.variance, largest))
+    error, variance = deletion.accusation(named)
+    if len(named) and found.alone is not None:
+        acquitted = _acquitted(found.alone(named), error, largest)
+        if acquitted.any():
+            named = named[~acquitted]
+            error, variance = deletion.accusation(named)
+    phi = np.zeros(len(eta))
+    phi[named] = np.maximum(error**2 - MARGIN * variance, 0.0) / noise[named]
+    return phi
 
 
-def _acquitted(
-    found: Suspicion, H: sparse.csr_array, named: IntArray, accused: FloatArray, price: float
-) -> IntArray:
-    """Those of the named channels that the snapshot without the forecast confirms."""
-    heard = of_snapshot(H, found.innovation, found.noise, named)
-    contradicted, standing = heard.search(np.ones(len(named), dtype=bool), price, most=1.0)
+def _acquitted(heard: Deletion, error: FloatArray, price: float) -> BoolArray:
+    """Which of the accused the snapshot without the forecast confirms.
+
+    ``error`` (k,) is what each of them is accused of.
+    """
+    contradicted = heard.search(np.ones(len(error), dtype=bool), price, most=1.0)
+    if contradicted.all():
+        return ~contradicted
+    standing = heard.without(contradicted)
     confirmed = ~contradicted & (standing.ratio < MARGIN)
-    excluded = (standing.error - accused[named]) ** 2 > price * standing.variance
-    return named[confirmed & excluded]
+    excluded = (standing.error - error) ** 2 > price * standing.variance
+    acquitted = np.asarray(confirmed & excluded)
+    return acquitted & (np.count_nonzero(acquitted) >= COMPANY)
 
 
 JUDGES: dict[str, Judge] = {"none": none, "trace": trace, "per_channel": per_channel}

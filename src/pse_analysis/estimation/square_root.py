@@ -19,16 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
-from pse_analysis.estimation.conditioning import (
-    Posterior,
-    Prior,
-    Rows,
-    Verdict,
-    block,
-    factor,
-    solve,
-    symmetric,
-)
+from pse_analysis.estimation.conditioning import Posterior, Prior, Rows, Verdict, block
+from pse_analysis.estimation.factors import Root, factor, solve, symmetric
 from pse_analysis.estimation.robust import Suspicion
 
 FloatArray = npt.NDArray[np.float64]
@@ -77,8 +69,7 @@ class Halves(NamedTuple):
             own = blas.dsyrk(1.0, self.odd.T, trans=1, lower=1, beta=1.0, c=rest)
             chol_S = factor(own, variance)
             white = solve(chol_S, innovation)
-            nis = float(white @ white)
-            inflation = verdict(Suspicion(innovation, variance, noise, chol_S, nis))
+            inflation = verdict(Suspicion(innovation, variance, noise, white, Root(chol_S)))
         chol_V = factor(rest, known + (1.0 + inflation) * noise)
         right = np.empty((m, prior.n + 1), order="F")
         right[:, :-1], right[:, -1] = self.odd[:, ::-1], innovation

@@ -93,10 +93,10 @@ def _contradicting(
     rows = np.flatnonzero(available)
     residual, noise = wls.model.residual(z, x)[rows], sigma[rows] ** 2
     every = np.arange(len(rows))
-    deletion = of_snapshot(wls.model.jacobian(x)[rows], residual, noise, every)
-    found, standing = deletion.search(start[rows], gate(len(rows))[1])
+    deletion = of_snapshot(wls.model, x, rows, residual, noise, every)
+    found = np.flatnonzero(deletion.search(start[rows], gate(len(rows))[1]))
     out, unseen = np.zeros(len(z), dtype=bool), np.zeros(len(z))
-    out[rows], unseen[rows] = found, standing.variance / noise
+    out[rows[found]], unseen[rows[found]] = True, deletion.accusation(found)[1] / noise[found]
     return out, unseen
 
 

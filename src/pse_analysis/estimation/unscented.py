@@ -22,8 +22,8 @@ symmetric product from P and repairs, at the next instant, a P that rounding lef
 anything. The former is the default because it measures better: a step takes two thirds of the time
 (``benchmarks/unscented.py``), a gate that stays closed costs nothing because S and its factor are
 there anyway, and its P stays definite by itself where the variance of every measurement is at least
-1e-12 of what the forecast expects of it, which 1e-6 p.u. is of 1 p.u. At 1e-16 it is not, and with
-next to no process noise the filter is lost, while ``square_root`` goes on.
+1e-12 of what the forecast expects of it, which 1e-6 p.u. is of 1 p.u. At 1e-16, and with next to no
+process noise, it is not and the filter is lost, while ``square_root`` goes on.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from scipy.linalg import blas, lapack
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.conditioning import Moments, Predicted, Prior, block
 from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.gaussian import Observation
 from pse_analysis.estimation.sigma_points import SigmaPoints, Spread
 from pse_analysis.estimation.square_root import Halves
+from pse_analysis.estimation.update import Observation
 from pse_analysis.measurement import BUS, FROM, TO, MeasurementModel, P, Q, wrap
 
 FloatArray = npt.NDArray[np.float64]
@@ -110,7 +110,8 @@ def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Mom
         own[block(curved, linear)] = product[entry].T
     cross[linear] = prior.P[entry]
     own[linear] = cross[:, entry].T
-    return Moments(spread.mean, own.T, cross.T, alpha)
+    first = isinstance(linear, slice) and linear.start == 0
+    return Moments(spread.mean, own.T, cross.T, alpha, entry if first else None)
 
 
 def halves(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Halves:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -181,6 +183,27 @@ class MeasurementModel:
     def jacobian(self, x: FloatArray) -> sparse.csr_array:
         """∂h/∂x at one state, (m, n): rows follow the layout, columns ``columns``."""
         return self.matrix(self.jacobian_data(x))
+
+    def gram(self, data: FloatArray) -> FloatArray:
+        """Lower triangle of JᵀJ, for entries of J in the order of the CSR pattern. (n, n)
+
+        Column by column, as LAPACK reads it.
+        """
+        n = self.shape[1]
+        left, right, place = self._products
+        lower = np.bincount(place, data[left] * data[right], n * n)
+        return lower.astype(np.float64, copy=False).reshape(n, n).T
+
+    @cached_property
+    def _products(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Pairs of entries that share a row, and where in JᵀJ their products go."""
+        count = np.diff(self.indptr)[self.row_of_entry]
+        left = np.repeat(np.arange(len(self.indices)), count)
+        first = np.repeat(self.indptr[self.row_of_entry] - np.cumsum(count) + count, count)
+        right = first + np.arange(len(left))
+        row, column = self.indices[left], self.indices[right].astype(np.int64)
+        lower = row >= column
+        return left[lower], right[lower], (column * self.shape[1] + row)[lower]
 
     @property
     def angular(self) -> npt.NDArray[np.bool_]:

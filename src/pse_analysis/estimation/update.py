@@ -1,0 +1,172 @@
+"""How a snapshot is taken in: predict it, judge the innovation, condition, maybe again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pse_analysis.estimation import robust
+from pse_analysis.estimation.conditioning import Posterior, Predicted, Prior
+from pse_analysis.estimation.deletion import Deletion, of_snapshot
+from pse_analysis.estimation.estimator import Info, Snapshot
+from pse_analysis.estimation.robust import Judge, Suspicion
+from pse_analysis.measurement import MeasurementModel, wrap
+from pse_analysis.vocabulary import Status
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Predicted]
+"""(prior, snapshot, rows, tuned, s) -> prediction of the rows, linearised at s where it matters."""
+
+TOLERANCE = 1e-6
+"""Largest move of a voltage in the last pass of an iterated filter. [rad, p.u.]"""
+
+
+class Observation(NamedTuple):
+    """How the measurements are predicted.
+
+    Attributes
+    ----------
+    predict : Observe
+    tuned : float
+        Memory at the start.
+    passes : int
+        How often the prediction is renewed at the estimate that it led to; 1: never.
+    """
+
+    predict: Observe
+    tuned: float = 0.0
+    passes: int = 1
+
+
+class Told(NamedTuple):
+    """What is to be told of a snapshot.
+
+    Attributes
+    ----------
+    iterations : int
+    nis : float
+        ηᵀS⁻¹η, or the objective of least squares.
+    dof : int
+        Its degrees of freedom.
+    innovation, variance, inflation : (r,) ndarray
+        Of the rows that report.
+    """
+
+    iterations: int
+    nis: float
+    dof: int
+    innovation: FloatArray
+    variance: FloatArray
+    inflation: FloatArray
+
+    def info(self, status: Status, snapshot: Snapshot, rows: IntArray, detail: str) -> Info:
+        """The same for all rows of the layout."""
+        m = len(snapshot.z)
+        innovation, deviation, inflation = np.full(m, np.nan), np.full(m, np.nan), np.zeros(m)
+        innovation[rows], deviation[rows] = self.innovation, np.sqrt(self.variance)
+        inflation[rows] = self.inflation
+        used = snapshot.available & snapshot.fresh
+        return Info(
+            status,
+            self.iterations,
+            self.nis,
+            self.dof,
+            used,
+            innovation,
+            deviation,
+            inflation,
+            detail,
+        )
+
+
+class Update(NamedTuple):
+    """What a snapshot changed.
+
+    Attributes
+    ----------
+    found : Posterior
+    innovation : (r,) ndarray
+        η of the last pass. [p.u., rad]
+    tuned : float
+        Memory of the observation.
+    iterations : int
+    converged : bool
+    """
+
+    found: Posterior
+    innovation: FloatArray
+    tuned: float
+    iterations: int
+    converged: bool
+
+    @property
+    def told(self) -> Told:
+        """What is to be told of it."""
+        found, dof = self.found, len(self.innovation)
+        return Told(
+            self.iterations, found.nis, dof, self.innovation, found.variance, found.inflation
+        )
+
+
+def update(
+    model: MeasurementModel,
+    observation: Observation,
+    prior: Prior,
+    snapshot: Snapshot,
+    rows: IntArray,
+    tuned: float,
+    judge: Judge,
+) -> Update:
+    """Condition a prior on some rows of a snapshot.
+
+    Parameters
+    ----------
+    model : MeasurementModel
+    observation : Observation
+    prior : Prior
+    snapshot : Snapshot
+    rows : (r,) ndarray of int
+        In any order; what is linear in the state is judged faster where it comes first.
+    tuned : float
+        Memory of the observation.
+    judge : Judge
+
+    Returns
+    -------
+    Update
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the innovation's covariance is lost.
+    """
+    R = snapshot.sigma[rows] ** 2
+    angular = model.angular[rows]
+    at = prior.s
+    converged = observation.passes == 1
+    verdict = None
+    if judge is not robust.none:
+        verdict = partial(_heard, judge, partial(of_snapshot, model, prior.x, rows))
+    for passes in range(1, observation.passes + 1):  # noqa: B007 (reported below)
+        predicted = observation.predict(prior, snapshot, rows, tuned, at)
+        eta = snapshot.z[rows] - predicted.mean
+        eta[angular] = wrap(eta[angular])
+        found = predicted.condition(prior, eta, R, verdict)
+        moved = np.abs(found.s - at).max()
+        at, tuned = found.s, predicted.tuned
+        if moved < TOLERANCE:
+            converged = True
+            break
+    return Update(found, eta, tuned, passes, converged)
+
+
+def _heard(judge: Judge, alone: Callable[..., Deletion], found: Suspicion) -> FloatArray:
+    """A judgement that may ask the snapshot alone."""
+    return judge(replace(found, alone=partial(alone, found.innovation, found.noise)))

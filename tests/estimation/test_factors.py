@@ -1,0 +1,74 @@
+"""Claim: what a triangular root gives without an inverse is what the inverse holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pse_analysis.estimation.factors import Columns, Root, squared_inverse
+
+from pse_analysis.estimation.conditioning import Moments, Prior
+from pse_analysis.estimation.robust import Suspicion
+
+SEED = 3
+
+
+def covariance(m: int) -> np.ndarray:
+    half = np.random.default_rng(SEED).standard_normal((m, m))
+    return half @ half.T + np.eye(m)
+
+
+@pytest.mark.parametrize("m", [1, 7, 128, 129, 300])
+def test_squares_of_the_inverse_root_are_the_diagonal_of_the_inverse(m: int) -> None:
+    S = covariance(m)
+    chol = np.linalg.cholesky(S)
+    # What stands above the diagonal does not count.
+    full = np.asfortranarray(chol + np.triu(np.ones((m, m)), 1))
+    expected = np.diagonal(np.linalg.inv(S))
+    np.testing.assert_allclose(squared_inverse(full), expected, rtol=1e-9)
+    known = Root(full, lambda: expected[: m // 2])
+    np.testing.assert_allclose(known.precision(), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rows", [[4], [4, 0, 11]], ids=str)
+def test_columns_are_those_of_the_inverses(rows: list[int]) -> None:
+    S = covariance(12)
+    chol = np.asfortranarray(np.linalg.cholesky(S))
+    root = Root(chol)
+    asked = np.array(rows)
+    for _ in range(2):  # made, then remembered
+        np.testing.assert_allclose(root.columns(asked), np.linalg.inv(chol)[:, asked], atol=1e-12)
+        np.testing.assert_allclose(root.precision_columns(asked), np.linalg.inv(S)[:, asked])
+
+
+def test_columns_are_made_once() -> None:
+    made: list[int] = []
+
+    def make(rows: np.ndarray) -> np.ndarray:
+        made.extend(rows)
+        return np.eye(5)[:, rows] * (rows + 1.0)
+
+    columns = Columns(5, make)
+    for asked in ([3], [1, 3], [3, 1, 0], []):
+        np.testing.assert_array_equal(
+            columns(np.array(asked, dtype=int)), np.diag(np.arange(1.0, 6.0))[:, asked]
+        )
+    assert made == [3, 1, 0]
+
+
+def test_measurements_of_the_state_itself_need_no_inverse() -> None:
+    """The diagonal of S⁻¹ for two rows that read an entry of s, from its posterior variance."""
+    P = covariance(4)
+    H = np.vstack([np.eye(4)[[2, 0]], np.random.default_rng(SEED).standard_normal((5, 4))])
+    noise = np.linspace(0.1, 0.7, 7)
+    prior = Prior(np.zeros(4), P, np.zeros(4), np.arange(4))
+    own, cross = np.asfortranarray(H @ P @ H.T), np.asfortranarray(P @ H.T)
+    seen: list[np.ndarray] = []
+
+    def verdict(found: Suspicion) -> np.ndarray:
+        seen.append(found.root.precision())
+        return np.zeros(7)
+
+    Moments(np.zeros(7), own, cross, entry=np.array([2, 0])).condition(
+        prior, np.ones(7), noise, verdict
+    )
+    np.testing.assert_allclose(seen[0], np.diagonal(np.linalg.inv(own + np.diag(noise))))
