@@ -12,7 +12,7 @@ import pytest
 from reference import channels_table
 
 from pse_analysis.alignment import AlignParams, Variant, align
-from pse_analysis.errors import TableError
+from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid import library
 from pse_analysis.parameters import Study
 from pse_analysis.vocabulary import Reason, check, severity
@@ -157,6 +157,41 @@ def test_values_and_sigmas_come_out_in_per_unit_with_the_sign_turned() -> None:
 def test_unknown_channel_is_named() -> None:
     with pytest.raises(TableError, match="'pmu:bus/9:vm_pu' is not in the channels table: add it"):
         aligned([("pmu:bus/9:vm_pu", 0, 0, 1.0)])
+
+
+def test_a_study_beside_the_telemetry_says_what_each_covers() -> None:
+    with pytest.raises(TableError, match=r"reaches from 2016-06-11 .* asks for 2016-06-09"):
+        aligned([(VM, 2 * 86400, None, 1.0)])
+
+
+def test_a_clock_that_was_reset_costs_neither_memory_nor_the_forecasts_of_the_rest() -> None:
+    rows = [(POWER, 900 * k, None, -1.0) for k in range(-8, 2)]
+    reset = pd.Timestamp("1970-01-01T00:00:00Z") - ZERO
+    forecast = AlignParams(growth="none", variants=(Variant("x", pseudo="holt"),))
+    plain = aligned(rows, forecast, minutes=60, history_s=7200.0)
+    odd = aligned([(POWER, reset.total_seconds(), None, -9.0), *rows], forecast, minutes=60,
+                  history_s=7200.0)  # fmt: skip
+    assert (plain["origin"] == "pseudo").any()
+    pd.testing.assert_frame_equal(odd, plain)
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        AlignParams(interpolate=("scadda",)),
+        AlignParams(max_age_s={"scadda": 60.0}),
+        AlignParams(variants=(Variant("x", face_value=("scadda",)),)),
+        AlignParams(variants=(Variant("x", time="dtw"),)),
+    ],
+)
+def test_a_source_that_is_not_there_is_refused(params: AlignParams) -> None:
+    with pytest.raises(ParameterError, match=r"\[align.*scad.*ami, pmu"):
+        aligned([(VM, 0, None, 1.0)], params)
+
+
+def test_an_age_below_zero_is_refused() -> None:
+    with pytest.raises(ParameterError, match="default_max_age_s > 0, received -5"):
+        AlignParams(default_max_age_s=-5)
 
 
 def test_no_usable_sample_gives_an_empty_table() -> None:

@@ -24,7 +24,7 @@ from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import Model, SensorLayout, standard_deviation, wrap
 from pse_analysis.parameters import Study
-from pse_analysis.vocabulary import Origin, check
+from pse_analysis.vocabulary import Origin, Quantity, check
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -100,6 +100,45 @@ class AlignParams:
                 )
         if not self.latency_s >= 0:
             raise ParameterError(f"[align] expected latency_s ≥ 0, received {self.latency_s}")
+        for name, age in {"default_max_age_s": self.default_max_age_s, **self.max_age_s}.items():
+            if not age > 0:
+                raise ParameterError(f"[align] expected {name} > 0, received {age}")
+
+    def fits(self, channels: pd.DataFrame) -> None:
+        """Whether the sources that are named are there.
+
+        Raises
+        ------
+        ParameterError
+            If a name is no source of the channels, or a variant has nothing to work on.
+        """
+        there = sorted(set(channels["source"]))
+        variants = self.variants or (Variant(self.variant),)
+        named = {"interpolate": self.interpolate, "max_age_s": tuple(self.max_age_s)}
+        named |= {f"variants] {v.name!r}: face_value": v.face_value for v in variants}
+        for where, sources in named.items():
+            for name in sources:
+                if name not in there:
+                    raise ParameterError(
+                        f"[align{'' if ']' in where else ']'} {where}: no channel has the source "
+                        f"{name!r}: expected one of {', '.join(there)}"
+                    )
+        for variant in variants:
+            timed, forecast = variant.time != "none", variant.pseudo != "none"
+            for asked, part, sources in (
+                (timed, "time", self.time.sources),
+                (forecast, "pseudo", self.pseudo.sources),
+            ):
+                if asked and not set(sources) & set(there):
+                    raise ParameterError(
+                        f"[align.variants] {variant.name!r} works on {', '.join(sources)}, but the "
+                        f"channels have {', '.join(there)}: name others in [align.{part}] sources"
+                    )
+            if timed and not (channels["quantity"] == Quantity.I_KA).any():
+                raise ParameterError(
+                    f"[align.variants] {variant.name!r}: sampling times are found beside measured "
+                    'currents, but no channel is i_ka: use time = "none"'
+                )
 
 
 def align(
@@ -133,7 +172,9 @@ def align(
     Raises
     ------
     TableError
-        If a channel is not in the channels table.
+        If a channel is not in the channels table, or no sample falls into the study.
+    ParameterError
+        If a source that is named is not there.
 
     Notes
     -----
@@ -144,7 +185,9 @@ def align(
     known at it.
     """
     params = params or AlignParams()
+    params.fits(channels)
     layout = SensorLayout.from_channels(channels, model)
+    validated = _within(validated, study, params)
     column = pd.Index(layout.channel).get_indexer(validated["channel"])
     if (column < 0).any():
         name = validated["channel"].iloc[int(np.argmin(column))]
@@ -174,6 +217,27 @@ def align(
         samples = stamped[variant.time]
         tables.append(_fuse(samples, instants, wait, layout, source, study, params, variant))
     return check("aligned", pd.concat(tables, ignore_index=True))
+
+
+def _within(validated: pd.DataFrame, study: Study, params: AlignParams) -> pd.DataFrame:
+    """Samples that an instant of the history or the study may use.
+
+    A clock that was reset stamps samples decades away; nothing is to be laid out over them.
+    """
+    oldest = max(params.default_max_age_s, *params.max_age_s.values(), params.pseudo.window_s)
+    latest = params.latency_s + params.time.largest_delay_s
+    since, until = (pd.Timestamp(t).tz_convert("UTC") for t in (study.history_start, study.end))
+    since -= pd.Timedelta(seconds=oldest)
+    times = validated["time_utc"]
+    inside = validated[(times >= since) & (times < until + pd.Timedelta(seconds=latest))]
+    begun = pd.Timestamp(study.start).tz_convert("UTC") - pd.Timedelta(seconds=oldest)
+    if len(validated) and not ((inside["time_utc"] >= begun) & (inside["time_utc"] < until)).any():
+        raise TableError(
+            f"telemetry reaches from {times.min():%Y-%m-%d %H:%M} to {times.max():%Y-%m-%d %H:%M} "
+            f"UTC, the study asks for {study.start:%Y-%m-%d %H:%M} to {study.end:%Y-%m-%d %H:%M}: "
+            "move [study] start and end"
+        )
+    return inside
 
 
 def _fuse(
