@@ -341,8 +341,6 @@ def test_protection_counts_refusals_in_a_row() -> None:
     used = np.array([True, True, True, False])
     assert not protection.latched(np.array([2, 1, 0, 9]), used)
     assert protection.latched(np.array([2, 3, 0, 0]), used)
-    assert protection.widening(np.array([0, 1, 40])) == pytest.approx(0.05**2)
-    assert protection.widening(np.array([4, 5, 4])) == pytest.approx(0.1**2)
     with pytest.raises(ParameterError, match="patience ≥ 1"):
         Protection(patience=0)
 

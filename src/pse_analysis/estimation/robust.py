@@ -3,7 +3,8 @@
 A gate decides whether a snapshot holds a gross error at all; then the noise of what contradicts is
 inflated, of every channel alike (`trace`, the form of [qu2018]) or of those that are wrong
 (`per_channel`). Neither can tell a wrong meter from a wrong forecast: a filter that refuses the
-same channels again and again doubts its forecast (`Protection`).
+same channels again and again doubts its forecast (`Protection`), and one that refuses whole
+snapshots again and again looks at the channels.
 """
 
 from __future__ import annotations
@@ -38,8 +39,7 @@ A movement is seen by several channels. A lone one that the forecast contradicts
 confirm is as often wrong, together with one of these.
 """
 FAR = 6.0
-"""Deviation from the forecast, in units of √S_ii, from which the search for wrong channels starts.
-"""
+"""Deviation, in units of its σ, from which a reading is no noise whatever the others say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,12 +157,13 @@ def per_channel(found: Suspicion) -> FloatArray:
 
     Notes
     -----
-    Beyond [qu2018]. The search (`Deletion.search`) starts from all that the forecast alone
-    contradicts by far, which a gross error cannot hide, and ends where no channel is worth leaving
-    out or taking back, at the price of the gate's bound on one channel. Then the accused are heard:
-    a channel is acquitted if the rest of the snapshot *without the forecast* agrees with it and
-    rules the error out that it is accused of. So a movement of the load that many channels see is
-    taken for one, whatever little the process noise allows.
+    Beyond [qu2018]. The search (`Deletion.search`) starts from all that the forecast alone does not
+    fully believe, which a gross error elsewhere cannot hide, and ends where no channel is worth
+    leaving out, taking back or exchanging, at the price of the gate's bound on one channel. Then
+    the accused are heard: a channel is acquitted if the rest of the snapshot *without the forecast*
+    agrees with it and rules the error out that it is accused of, and not it alone (`COMPANY`). So a
+    movement of the load that many channels see is taken for one, whatever little the process noise
+    allows.
     """
     eta, noise = found.innovation, found.noise
     total, largest = gate(len(eta))
@@ -208,23 +209,20 @@ class Protection:
     Attributes
     ----------
     patience : int
-        Consecutive refusals after which a channel counts as stuck.
+        Consecutive refusals after which a channel counts as stuck. A snapshot that would be as many
+        in a row to be refused as a whole is judged by channel instead.
     share : float
         Share of the channels that must be stuck.
-    sigma : float
-        Standard deviation by which the forecast is widened where a snapshot alone does not
-        determine the state. [p.u., rad]
     """
 
     patience: int = 3
     share: float = 0.02
-    sigma: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.patience < 1 or not 0 < self.share <= 1 or self.sigma <= 0:
+        if self.patience < 1 or not 0 < self.share <= 1:
             raise ParameterError(
-                "protection: expected patience ≥ 1, 0 < share ≤ 1 and sigma > 0, received "
-                f"{self.patience}, {self.share}, {self.sigma}"
+                "protection: expected patience ≥ 1 and 0 < share ≤ 1, received "
+                f"{self.patience}, {self.share}"
             )
 
     def latched(self, refusals: IntArray, used: BoolArray) -> bool:
@@ -243,11 +241,3 @@ class Protection:
         """Why a filter doubts its forecast, in words."""
         stuck = int(np.count_nonzero(refusals >= self.patience))
         return f"{stuck} of {len(refusals)} channels were refused {self.patience} times in a row"
-
-    def widening(self, refusals: IntArray) -> float:
-        """Variance to add to every voltage; it grows while most channels stay refused.
-
-        Meters that are wrong for good refuse to agree as well, but they are few.
-        """
-        in_vain = float(np.median(refusals)) // self.patience
-        return float((self.sigma * max(1.0, in_vain)) ** 2)
