@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pse_analysis.estimation.recovery import Recovery
-from pse_analysis.estimation.update import Update, update
 from qu_bench import Bench, still
 
 from pse_analysis.estimation import robust
 from pse_analysis.estimation.conditioning import Prior
+from pse_analysis.estimation.recovery import Recovery
 from pse_analysis.estimation.robust import Protection
 from pse_analysis.estimation.start import begin
+from pse_analysis.estimation.update import Update, update
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.measurement import VA, VM, P, Q
 

@@ -6,12 +6,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pse_analysis.estimation.factors import Root
 from qu_bench import Bench, gross_errors, real_day, still
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import robust
 from pse_analysis.estimation.driver import run
+from pse_analysis.estimation.factors import Root
 from pse_analysis.estimation.gaussian import estimator
 from pse_analysis.estimation.replay import EPOCH, Replay, replay
 from pse_analysis.estimation.robust import MARGIN, Protection, Suspicion, gate
