@@ -15,6 +15,7 @@ TIMES = pd.date_range("2024-05-14T12:00Z", periods=10, freq="5min")
 def validated() -> pd.DataFrame:
     """Ten samples of three channels: most of c are bad, one of a is, the fourth is silent."""
     frame = pd.DataFrame({"channel": np.repeat(CHANNELS[:3], 10), "flag": 0, "reasons": 0})
+    frame["threshold"] = np.where(frame["channel"] == "b", np.nan, 0.1)
     frame.loc[[3, *range(20, 29)], ["flag", "reasons"]] = int(Flag.BAD), int(Reason.LIMIT)
     frame.loc[5, ["flag", "reasons"]] = int(Flag.SUSPECT), int(Reason.LATE)
     return frame
@@ -44,6 +45,8 @@ def test_samples_are_counted_by_reason_and_silent_channels_are_named() -> None:
     told = account.of_run(CHANNELS, validated(), steps(["ok"] * 10), residuals(a=1.0))
     assert told == [
         "telemetry: 30 samples of 4 channels, 11 flagged, reasons: limit 10, late 1",
+        "channels without a threshold for their changes (no history to learn it from, or no rule "
+        "asks for one), so that limits and stamps alone were checked: b, dead",
         "channels without a usable sample: dead",
         "channels of which most samples are flagged: c (90%)",
     ]
@@ -52,9 +55,7 @@ def test_samples_are_counted_by_reason_and_silent_channels_are_named() -> None:
 def test_steps_that_did_not_work_are_told_with_their_first_reason() -> None:
     wrong = steps(["ok", "unobservable", "unobservable", "diverged"], "add a flow")
     told = account.of_run(CHANNELS, validated(), wrong, residuals(a=1.0))
-    assert (
-        "wls: 2 steps unobservable, 1 steps diverged; first at 2024-05-14 12:05: add a flow" in told
-    )
+    assert "wls: 2 × unobservable, 1 × diverged; first at 2024-05-14 12:05: add a flow" in told
 
 
 def test_a_channel_that_no_method_agrees_with_is_named_and_one_that_a_method_lost_is_not() -> None:

@@ -55,6 +55,13 @@ def _samples(channels: Sequence[str], validated: pd.DataFrame) -> Iterable[str]:
     if kinds:
         text += f", reasons: {', '.join(f'{kind} {n:,}' for n, kind in kinds)}"
     yield text
+    judged = set(validated.loc[validated["threshold"].notna(), "channel"])
+    blind = [name for name in channels if name not in judged]
+    if blind:
+        yield (
+            f"channels without a threshold for their changes (no history to learn it from, or no "
+            f"rule asks for one), so that limits and stamps alone were checked: {_named(blind)}"
+        )
     heard = set(validated["channel"].to_numpy()[good])
     silent = [name for name in channels if name not in heard]
     if silent:
@@ -70,7 +77,7 @@ def _steps(steps: pd.DataFrame) -> Iterable[str]:
     wrong = steps[~steps["status"].isin((Status.OK, Status.PREDICTED))]
     for method, own in wrong.groupby("method", sort=False):
         counts = own["status"].value_counts()
-        text = f"{method}: {', '.join(f'{n} steps {status}' for status, n in counts.items())}"
+        text = f"{method}: {', '.join(f'{n} × {status}' for status, n in counts.items())}"
         told = own[own["detail"] != ""]
         if len(told):
             first = told.iloc[0]
