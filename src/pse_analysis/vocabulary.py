@@ -38,6 +38,7 @@ from pse_analysis.errors import TableError
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pandera.errors
     import pandera.pandas as pa
 
 
@@ -259,7 +260,14 @@ def schema(table: str) -> pa.DataFrameSchema:
         return col(None, strings, *checks)
 
     def one_of(values: type[enum.StrEnum]) -> pa.Check:
-        return pa.Check.isin([str(v) for v in values])
+        names = [str(v) for v in values]
+        return pa.Check.isin(names, error=f"one of {', '.join(map(repr, names))}")
+
+    above_0, not_below_0 = pa.Check.gt(0, error="above 0"), pa.Check.ge(0, error="0 or above")
+    element = pa.Check.str_matches(
+        r"^(bus|branch|machine)/.+", error="bus/NAME, branch/NAME or machine/NAME"
+    )
+    flags = ", ".join(f"{int(f)} ({f.name.lower()})" for f in Flag)
 
     utc = "datetime64[us, UTC]"
     key_sample = {"trial": col("int32"), "channel": text(), "seq": col("int64")}
@@ -270,7 +278,7 @@ def schema(table: str) -> pa.DataFrameSchema:
         "quality": col("Int16", nullable=True),
     }
     finding = {
-        "flag": col("int8", pa.Check.isin([int(f) for f in Flag])),
+        "flag": col("int8", pa.Check.isin([int(f) for f in Flag], error=f"one of {flags}")),
         "reasons": col("int32"),
     }
     step_key = {"method": text(), "trial": col("int32"), "time_utc": col(utc)}
@@ -280,15 +288,15 @@ def schema(table: str) -> pa.DataFrameSchema:
             "channel": text(),
             "source": text(one_of(Source)),
             "quantity": text(one_of(Quantity)),
-            "element": text(pa.Check.str_matches(r"^(bus|branch|machine)/.+")),
+            "element": text(element),
             "side": text(one_of(Side)),
             "unit": text(),
-            "sigma": col("float64", pa.Check.gt(0)),
+            "sigma": col("float64", above_0),
             "sigma_kind": text(one_of(SigmaKind)),
             "lower": col("float64", nullable=True),
             "upper": col("float64", nullable=True),
-            "period_s": col("float64", pa.Check.gt(0)),
-            "sign": col("int8", pa.Check.isin([-1, 1])),
+            "period_s": col("float64", above_0),
+            "sign": col("int8", pa.Check.isin([-1, 1], error="1 or -1")),
             "aggregation": text(one_of(Aggregation)),
         },
         "truth": {
@@ -321,12 +329,12 @@ def schema(table: str) -> pa.DataFrameSchema:
             "time_utc": col(utc),
             "channel": text(),
             "value_pu": col("float64"),
-            "sigma_pu": col("float64", pa.Check.gt(0)),
-            "sigma_age_pu": col("float64", pa.Check.ge(0)),
+            "sigma_pu": col("float64", above_0),
+            "sigma_age_pu": col("float64", not_below_0),
             "origin": text(one_of(Origin)),
             "sample_utc": col(utc),
-            "time_confidence": col("float64", pa.Check.in_range(0, 1)),
-            "age_s": col("float64", pa.Check.ge(0)),
+            "time_confidence": col("float64", pa.Check.in_range(0, 1, error="0 … 1")),
+            "age_s": col("float64", not_below_0),
             **finding,
         },
         "estimated": {
@@ -340,8 +348,8 @@ def schema(table: str) -> pa.DataFrameSchema:
             **step_key,
             "channel": text(),
             "innovation": col("float64"),
-            "sigma_innovation": col("float64", pa.Check.gt(0)),
-            "inflation": col("float64", pa.Check.ge(0)),
+            "sigma_innovation": col("float64", above_0),
+            "inflation": col("float64", not_below_0),
             "used": col("bool"),
             "reasons": col("int32"),
         },
@@ -390,18 +398,44 @@ def check(table: str, frame: pd.DataFrame) -> pd.DataFrame:
     try:
         checked = expected.validate(frame[list(expected.columns)], lazy=False)
     except pandera.errors.SchemaError as error:
-        column = getattr(error.schema, "name", None) or "?"
-        cases = getattr(error, "failure_cases", None)
-        received = ""
-        if cases is not None and hasattr(cases, "iloc") and len(cases):
-            first = cases["failure_case"].iloc[0]
-            received = f"; received {first.item() if isinstance(first, np.generic) else first!r}"
-        raise TableError(
-            f"{table}: column {column!r} breaks its schema: {error.check}{received}"
-        ) from error
+        raise TableError(_broken(table, frame, error)) from error
     if table != "faults":
         repeated = checked.duplicated(list(KEYS[table]))
         if repeated.any():
-            row = checked.loc[repeated, list(KEYS[table])].iloc[0].to_dict()
-            raise TableError(f"{table}: {int(repeated.sum())} repeated keys, the first is {row}")
+            row = ", ".join(
+                f"{key} {shown(checked.loc[repeated, key].iloc[0])}" for key in KEYS[table]
+            )
+            raise TableError(
+                f"{table}: {int(repeated.sum())} rows repeat the key of another, the first has "
+                f"{row}; expected one row each: leave one out, or give it a key of its own"
+            )
     return cast("pd.DataFrame", checked)
+
+
+def shown(value: object) -> str:
+    """A value as a message shows it, without numpy's or pandas' type around it."""
+    if hasattr(value, "isoformat"):
+        return str(value)
+    return repr(value.item() if isinstance(value, np.generic) else value)
+
+
+def _broken(table: str, frame: pd.DataFrame, error: pandera.errors.SchemaError) -> str:
+    """The row that breaks its schema, what was expected there and what came."""
+    column = str(getattr(error.schema, "name", None) or "?")
+    series, where = frame[column], f"{table}: column {column!r}"
+    if str(error.check) == "not_nullable":
+        wanted, bad = "a value in every row", series.isna()
+    elif getattr(error.check, "error", None) == "text":
+        wanted, bad = "text", ~series.map(lambda value: isinstance(value, str))
+    elif getattr(error.check, "error", None):
+        wanted, bad = error.check.error, series.index.isin(error.failure_cases["index"])
+    else:
+        kind = schema(table).columns[column].dtype
+        first = f", e.g. {shown(series.iloc[0])}" if len(series) else ""
+        return f"{where}: expected type {kind}, received {series.dtype}{first}; convert the column"
+    row = int(np.argmax(np.asarray(bad)))
+    keys = [f"{key} {shown(frame[key].iloc[row])}" for key in KEYS[table] if key != column]
+    return (
+        f"{where}{' of ' if keys else ''}{', '.join(keys)}: expected {wanted}, received "
+        f"{shown(series.iloc[row])}; mend that row, or leave it out"
+    )

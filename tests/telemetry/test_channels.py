@@ -32,12 +32,17 @@ def changed(**cells: object) -> pd.DataFrame:
             r"no branch '67': did you mean '6-7'",
         ),
         ({"unit": "mw"}, r"does not fit vm_pu: expected 'pu' or 'kv', received 'mw'"),
-        ({"sigma": 0.0}, r"sigma of 'pmu:bus/2:vm_pu' must be .* above 0, received .*0.0"),
-        ({"sigma": np.nan}, r"sigma of .* received .*nan"),
+        ({"sigma": 0.0}, r"sigma of 'pmu:bus/2:vm_pu' must be .* above 0, received 0.0"),
+        ({"sigma": np.nan}, r"sigma of .* received nan"),
+        ({"sigma": np.inf}, r"sigma of .* received inf"),
+        ({"lower": 1.2, "upper": 0.8}, r"lower = 1.2 of 'pmu:bus/2:vm_pu' lies above upper = 0.8"),
         ({"side": "from"}, r"side of .* at 'bus/2': expected '', received 'from'"),
         ({"element": "branch/6-7", "side": "from"}, "a voltage belongs to a bus"),
-        ({"element": "node/2"}, "column 'element' breaks its schema"),
-        ({"quantity": "vm"}, "column 'quantity' breaks its schema"),
+        (
+            {"element": "node/2"},
+            "'element' of channel 'pmu:bus/2:vm_pu': expected bus/NAME, .*'node/2'",
+        ),
+        ({"quantity": "vm"}, "'quantity' of channel .*: expected one of 'vm_pu', .*received 'vm'"),
     ],
 )
 def test_a_channel_that_does_not_fit_is_refused(cells, message):

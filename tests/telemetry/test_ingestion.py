@@ -144,7 +144,13 @@ def test_what_was_taken_in_can_be_written_and_read(tmp_path):
     [
         (frame().drop(columns="value"), r"column 'value' is missing; .*received channel, time_utc"),
         (frame().iloc[:0], "no rows; expected at least one sample"),
-        (frame(value=list("abcdef")), r"must be numeric, received object.*to_numeric"),
+        (frame(value=[1, 2, "Bad", 4, 5, 6]), r"numeric, received object, e.g. 'Bad'.*to_numeric"),
+        (frame(value=["1,5"] * 6), r"e.g. '1,5'; read decimal commas with .*decimal=','"),
+        (frame(channel=["U6", None] * 3), "channel is empty in 3 rows, first row 1"),
+        (frame(quality=[0, 0x80000000] * 3), r"-32768 to 32767, received 2147483648.*2\*\*30"),
+        (frame(quality=70000), "quality.*received 70000"),
+        (frame(trial=2**31), "trial.*received 2147483648"),
+        (frame(trial=0.5), "'trial' must hold whole numbers, received float64, e.g. 0.5"),
         (frame(value=[True] * 6), "must be numeric, received bool"),
         (
             frame(time_utc=frame().time_utc.dt.tz_localize(None)),
@@ -167,16 +173,44 @@ def test_an_hour_that_occurs_twice_needs_utc():
         ingest(frame(time_utc=times), channels(), feeder(), timezone="Europe/Berlin")
 
 
+def test_an_unknown_zone_is_no_matter_of_summer_time():
+    times = frame().time_utc.dt.tz_localize(None)
+    with pytest.raises(TableError, match="no time zone 'Europe/Berln': did you mean 'Europe/Berl"):
+        ingest(frame(time_utc=times), channels(), feeder(), timezone="Europe/Berln")
+
+
+def test_two_columns_of_one_name_are_refused():
+    with pytest.raises(TableError, match="'value' names two columns once columns= is applied"):
+        ingest(frame(reading=1.0), channels(), feeder(), columns={"reading": "value"})
+
+
+def test_blank_cells_of_a_csv_file_take_their_defaults(tmp_path):
+    full = ingest(frame(), channels(), feeder())
+    for kept in (slice(None), slice(2)):
+        blank = channels().iloc[kept].assign(aggregation=np.nan, lower=np.nan)
+        blank["sign"] = blank["sign"].where(blank["sign"] == -1)
+        blank.to_csv(tmp_path / "channels.csv", index=False)
+        own = frame()[frame().channel.isin(blank.channel)]
+        raw = ingest(own, pd.read_csv(tmp_path / "channels.csv"), feeder())
+        expected = full.channels.iloc[kept].assign(
+            lower=raw.channels.lower, upper=raw.channels.upper
+        )
+        pd.testing.assert_frame_equal(raw.channels, expected)
+
+
 @pytest.mark.parametrize(
     ("cell", "message"),
     [
         (("element", "bus/66"), "has no bus '66'"),
         (("unit", "MW"), "does not fit vm_pu"),
-        (("sigma", -1.0), "must be a standard deviation above 0"),
+        (("sigma", -1.0), "must be a finite standard deviation above 0, received -1.0"),
+        (("sign", 257), "sign of 'U6' must be 1, or -1 .*; received 257"),
+        (("sign", 1.5), "sign of 'U6' must be 1, or -1 .*; received 1.5"),
     ],
 )
 def test_broken_channels_are_refused(cell, message):
     broken = channels()
+    broken[cell[0]] = broken[cell[0]].astype(object)
     broken.loc[0, cell[0]] = cell[1]
     with pytest.raises(TableError, match=message):
         ingest(frame(), broken, feeder())

@@ -14,7 +14,7 @@ from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import INPUT, STATES, Machine
 from pse_analysis.measurement import Model
-from pse_analysis.vocabulary import UNITS, Quantity, check
+from pse_analysis.vocabulary import UNITS, Quantity, check, shown
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -32,14 +32,21 @@ def check_channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     """
     if "sigma" in channels.columns and "channel" in channels.columns:
         sigma = pd.to_numeric(channels["sigma"], errors="coerce")
-        bad = ~(sigma > 0).to_numpy()
+        bad = ~((sigma > 0) & np.isfinite(sigma)).to_numpy()
         if bad.any():
             row = channels.loc[bad].iloc[0]
             raise TableError(
-                f"channels: sigma of {row['channel']!r} must be a standard deviation above 0, "
-                f"received {row['sigma']!r}; take it from the sensor's accuracy class"
+                f"channels: sigma of {row['channel']!r} must be a finite standard deviation above "
+                f"0, received {shown(row['sigma'])}; take it from the sensor's accuracy class"
             )
     checked = check("channels", channels)
+    crossed = checked["lower"] > checked["upper"]
+    if crossed.any():
+        row = checked.loc[crossed].iloc[0]
+        raise TableError(
+            f"channels: lower = {row['lower']:g} of {row['channel']!r} lies above upper = "
+            f"{row['upper']:g}: swap them"
+        )
     names: dict[str, tuple[str, ...]] = (
         {"machine": (model.name,)}
         if isinstance(model, Machine)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
+from zoneinfo import available_timezones
 
 import numpy as np
 import pandas as pd
@@ -12,9 +13,9 @@ import pandas as pd
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import Model, SensorLayout
-from pse_analysis.telemetry.channels import check_channels, check_known, check_shunts
+from pse_analysis.telemetry.channels import check_channels, check_known, check_shunts, suggest
 from pse_analysis.telemetry.tables import RawCase
-from pse_analysis.vocabulary import UNITS, Quantity, check
+from pse_analysis.vocabulary import UNITS, Quantity, check, shown
 
 log = logging.getLogger(__name__)
 
@@ -87,6 +88,11 @@ def ingest(
     """
     given = _channels(channels, model)
     frame = frame.rename(columns=dict(columns or {}))
+    if not frame.columns.is_unique:
+        raise TableError(
+            f"telemetry: {frame.columns[frame.columns.duplicated()][0]!r} names two columns once "
+            f"columns= is applied; expected one: drop the other, or leave it out of columns="
+        )
     for name in ("channel", "time_utc", "value"):
         if name not in frame.columns:
             raise TableError(
@@ -96,6 +102,11 @@ def ingest(
     if frame.empty:
         raise TableError("telemetry: no rows; expected at least one sample: check the export")
     channel = frame["channel"].astype(object)
+    if channel.isna().any():
+        raise TableError(
+            f"telemetry: channel is empty in {int(channel.isna().sum())} rows, first row "
+            f"{int(np.argmax(channel.isna()))}; name it, or leave those rows out"
+        )
     if tags is not None:
         channel = channel.map(lambda tag: tags.get(tag, tag))
     channel = channel.astype(str)
@@ -103,10 +114,12 @@ def ingest(
 
     value = frame["value"]
     if not pd.api.types.is_numeric_dtype(value.dtype) or pd.api.types.is_bool_dtype(value.dtype):
+        texts = value[pd.to_numeric(value, errors="coerce").isna() & value.notna()]
         raise TableError(
             f"telemetry: column 'value' must be numeric, received {value.dtype}, e.g. "
-            f"{value.iloc[0]!r}; use pandas.to_numeric(frame.value, errors='coerce'): what is no "
-            "number becomes NaN and is flagged as missing"
+            f"{shown((texts if len(texts) else value).iloc[0])}; read decimal commas with "
+            "pandas.read_csv(decimal=','); pandas.to_numeric(frame.value, errors='coerce') turns "
+            "what is no number into NaN, which is flagged as missing"
         )
     standard = given.assign(
         unit=[UNITS[Quantity(q)][0] for q in given["quantity"]],
@@ -132,12 +145,12 @@ def ingest(
     )
     telemetry = pd.DataFrame(
         {
-            "trial": _integers(frame, "trial", 0).astype(np.int32),
+            "trial": _integers(frame, "trial", 0, np.int32).astype(np.int32),
             "channel": channel.to_numpy(dtype=object),
             "time_utc": time.array,
             "arrival_utc": arrival.array,
             "value": value.to_numpy(dtype=np.float64, na_value=np.nan) * ratio[row],
-            "quality": pd.array(_integers(frame, "quality", None), dtype="Int16"),
+            "quality": pd.array(_integers(frame, "quality", None, np.int16), dtype="Int16"),
         }
     )
     # Rows of an export stand in any order; without arrivals only the stamps tell which came first.
@@ -155,17 +168,25 @@ def ingest(
 
 def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     """The channels as given, with defaults, plain spellings of units and the schema's types."""
-    filled = channels.assign(
-        **{n: v for n, v in _CHANNEL_DEFAULTS.items() if n not in channels.columns}
-    )
+    filled = channels.copy()
+    for name, default in _CHANNEL_DEFAULTS.items():
+        # A CSV file spells an absent cell NaN.
+        given = filled[name] if name in filled.columns else pd.Series(np.nan, filled.index)
+        filled[name] = given.where(given.notna(), default) if given.notna().any() else default
     if "unit" in filled.columns:
         unit = filled["unit"].astype(str).str.strip().str.lower()
         filled["unit"] = unit.map(lambda u: _UNIT_NAMES.get(u, u)).astype(object)
     for name in ("sigma", "lower", "upper", "period_s"):
         if name in filled.columns and pd.api.types.is_numeric_dtype(filled[name].dtype):
             filled[name] = filled[name].astype(np.float64)
-    if "sign" in filled.columns and pd.api.types.is_numeric_dtype(filled["sign"].dtype):
-        filled["sign"] = filled["sign"].astype(np.int8)
+    wrong = ~filled["sign"].isin([-1, 1])
+    if wrong.any() and "channel" in filled.columns:
+        row = filled.loc[wrong].iloc[0]
+        raise TableError(
+            f"channels: sign of {row['channel']!r} must be 1, or -1 where the source counts "
+            f"consumption as positive; received {shown(row['sign'])}"
+        )
+    filled["sign"] = filled["sign"].astype(np.int8)
     return check_channels(filled.reset_index(drop=True), model)
 
 
@@ -199,6 +220,12 @@ def _utc(times: pd.Series, name: str, timezone: str | None) -> pd.Series:
                 "UTC or any other zone: pass timezone='UTC' or e.g. timezone='Europe/Berlin'"
             )
         try:
+            pd.Timestamp(0).tz_localize(timezone)
+        except Exception as error:
+            raise TableError(
+                f"telemetry: no time zone {timezone!r}: {suggest(timezone, available_timezones())}"
+            ) from error
+        try:
             times = times.dt.tz_localize(timezone)
         except Exception as error:
             raise TableError(
@@ -209,14 +236,23 @@ def _utc(times: pd.Series, name: str, timezone: str | None) -> pd.Series:
 
 
 def _integers(
-    frame: pd.DataFrame, name: str, default: int | None
+    frame: pd.DataFrame, name: str, default: int | None, kind: type[np.signedinteger[Any]]
 ) -> pd.api.extensions.ExtensionArray:
     if name not in frame.columns:
         return pd.array([default] * len(frame), dtype="Int64")
     try:
-        return frame[name].astype("Int64").array
-    except (TypeError, ValueError) as error:
+        whole = frame[name].astype("Int64")
+    except (TypeError, ValueError, OverflowError) as error:
         raise TableError(
-            f"telemetry: column {name!r} must hold whole numbers, received "
-            f"{frame[name].dtype}, e.g. {frame[name].iloc[0]!r}: map the source's codes to numbers"
+            f"telemetry: column {name!r} must hold whole numbers, received {frame[name].dtype}, "
+            f"e.g. {shown(frame[name].iloc[0])}: map the source's codes to numbers"
         ) from error
+    low, high = np.iinfo(kind).min, np.iinfo(kind).max
+    wide = whole[~whole.between(low, high).fillna(True)]
+    if len(wide):
+        raise TableError(
+            f"telemetry: column {name!r} must hold whole numbers from {low} to {high}, received "
+            f"{wide.iloc[0]}: map the source's codes to smaller ones (of a status code of OPC UA, "
+            "quality // 2**30 is the severity)"
+        )
+    return whole.array
