@@ -114,17 +114,44 @@ def test_levels_of_known_shapes_are_found_from_innovations_alone() -> None:
     half = rng.normal(size=(2, 8, 3))
     D = half @ half.transpose(0, 2, 1)
     root = np.linalg.cholesky(np.eye(8) + np.tensordot(truth, D, 1))
-    made = Matching(lambda _voltage: (), np.ones(2), window=draws)
+    made = Matching(lambda _voltage: (), np.ones(2), window=1e9)
     memory = made.begin()
     for _ in range(draws):
         L = np.linalg.cholesky(np.eye(8) + np.tensordot(memory.level, D, 1))
         inverse = np.linalg.inv(L)
         response = inverse @ D @ inverse.T
         memory = made.learn(memory, response, inverse @ root @ rng.normal(size=8))
-    A = sum(information for information, _ in memory.evidence)
-    error = np.sqrt(np.diagonal(np.linalg.inv(A / 2)))
+    error = np.sqrt(np.diagonal(np.linalg.inv(memory.A / 2)))
     assert (np.abs(memory.level - truth) < 4 * error).all()
     assert (error < 0.2 * truth).all()
+
+
+def test_a_level_that_is_not_seen_keeps_its_scale() -> None:
+    """Two shapes, of which the meters see the first only: the other is known by its start alone."""
+    made = Matching(lambda _voltage: (), np.array([1.0, 4.0]))
+    memory = made.begin()
+    rng = np.random.default_rng(SEED)
+    for _ in range(100):
+        response = np.stack([np.eye(5), np.zeros((5, 5))])
+        memory = made.learn(memory, response, rng.normal(size=5))
+        assert 1.0 < memory.level[1] / made.start[1] < 4.0
+
+
+def test_a_level_is_the_mean_of_what_it_may_be() -> None:
+    """Beside 4e6 draws from the posterior of a level whose best fit lies below zero."""
+    made = Matching(lambda _voltage: (), np.array([0.5]), window=1e9)
+    memory = made.begin()
+    for _ in range(5):
+        memory = made.learn(memory, 0.4 * np.ones((1, 1, 1)), np.array([0.3]))
+    # The start counts as one more step.
+    A = memory.A[0, 0] * (1.0 + 1.0 / 5.0)
+    best = (memory.b[0] + memory.A[0, 0] / 5.0 * 0.5) / A
+    assert best < 0
+    root = np.sqrt(0.5) * np.abs(np.random.default_rng(SEED).standard_t(3, 4_000_000))
+    level = root[root**2 < best + 50.0] ** 2
+    weight = np.exp(-0.25 * A * (level - best) ** 2)
+    expected = (weight * level).sum() / weight.sum()
+    np.testing.assert_allclose(memory.level[0], expected, rtol=0.01)
 
 
 @pytest.mark.parametrize(("start", "window"), [(np.array([0.0, 1.0]), 5), (np.ones(2), 0)])

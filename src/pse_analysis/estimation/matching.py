@@ -2,7 +2,8 @@
 
 Q = Σ θ_k B_k B_kᵀ has a few known shapes, and the levels θ are estimated: single loads that move on
 their own, all loads together, the source. Whatever the levels, Q belongs to the grid and is
-semi-definite, and a window of some hours holds enough innovations for so few numbers.
+semi-definite, and some hours hold enough innovations for so few numbers. What is passed on is not
+the best fit of a level but the mean of what it may be, so that P knows of the doubt.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, optimize
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.process import Sensitivity
@@ -24,25 +24,36 @@ ComplexArray = npt.NDArray[np.complex128]
 
 START = np.array([0.02, 0.02, 1e-3]) ** 2
 """Levels before anything was seen: (share of nominal load)² alone and together, and p.u.²"""
-WINDOW = 36
-"""Steps of which the innovations count; three hours of five minutes."""
+WINDOW = 18
+"""Steps after which the weight of an innovation has faded to 1/e.
+
+Innovations are then as old on average as in a window of 36, three hours of five minutes.
+"""
 FLOOR = 1e-4
 """Smallest share of its start that a level may sink to: no movement is ever ruled out."""
+BEYOND = 100.0
+"""How far above its best fit a level is looked for, over its start."""
+GRID = (np.arange(64) + 0.5) / 64
+"""Where √θ is tried, over the largest that is credible."""
 
 
 class Matched(NamedTuple):
-    """Levels, and what the innovations of the window say about them.
+    """Levels, and what the innovations so far say about them.
 
     Attributes
     ----------
     level : (c,) ndarray
         θ.
-    evidence : tuple of ((c, c), (c,)) ndarrays
-        Normal equations A θ = b of every step.
+    A, b : (c, c), (c,) ndarray
+        Normal equations A θ = b, sums that fade.
+    steps : float
+        Sum of the weights that are in them.
     """
 
     level: FloatArray
-    evidence: tuple[tuple[FloatArray, FloatArray], ...] = ()
+    A: FloatArray
+    b: FloatArray
+    steps: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +65,14 @@ class Matching:
     halves : (voltage (N,)) -> tuple of c (2N, r_k) ndarrays
         B_k at a forecast voltage.
     start : (c,) ndarray
-        Levels at the start, which count as one step of the window.
-    window : int
+        Levels at the start, which count as one step.
+    window : float
+        Steps after which the weight of an innovation has faded to 1/e.
     """
 
     halves: Callable[[ComplexArray], tuple[FloatArray, ...]]
     start: FloatArray
-    window: int = WINDOW
+    window: float = WINDOW
 
     def __post_init__(self) -> None:
         if self.window < 1 or not (self.start > 0).all():
@@ -71,7 +83,8 @@ class Matching:
 
     def begin(self) -> Matched:
         """Before the first innovation."""
-        return Matched(self.start)
+        c = len(self.start)
+        return Matched(self.start, np.zeros((c, c)), np.zeros(c))
 
     def learn(self, memory: Matched, response: FloatArray, white: FloatArray) -> Matched:
         """Levels for the next step.
@@ -87,33 +100,42 @@ class Matching:
         Notes
         -----
         The levels whose S fits ηηᵀ best in the least squares of L⁻¹(ηηᵀ - S)L⁻ᵀ, summed over the
-        window: Σ tr(S⁻¹D_k S⁻¹D_l) θ_l = Σ ηᵀS⁻¹D_k S⁻¹η - tr(S⁻¹D_k S⁻¹C), where C is the rest
-        of S. This is a step of Fisher's scoring for the likelihood, with the earlier steps'
-        covariance taken as given.
+        past: Σ tr(S⁻¹D_k S⁻¹D_l) θ_l = Σ ηᵀS⁻¹D_k S⁻¹η - tr(S⁻¹D_k S⁻¹C), where C is the rest of S.
+        This is a step of Fisher's scoring for the likelihood, with the earlier steps' covariance
+        taken as given, so the estimate has the covariance 2 A⁻¹.
         """
-        information = np.einsum("kij,lij->kl", response, response)
+        flat = response.reshape(len(response), -1)
+        information = flat @ flat.T
         surprise = white @ response @ white - np.trace(response, axis1=1, axis2=2)
-        step = information, surprise + information @ memory.level
-        evidence = (*memory.evidence, step)[-self.window :]
-        A = np.mean([a for a, _ in evidence], axis=0)
-        total = A * (len(evidence) + 1)
-        target = np.sum([b for _, b in evidence], axis=0) + A @ self.start
-        return Matched(self._solved(total, target), evidence)
+        fading = np.exp(-1.0 / self.window)
+        A = fading * memory.A + information
+        b = fading * memory.b + surprise + information @ memory.level
+        steps = fading * memory.steps + 1.0
+        prior = A / steps
+        return Matched(self._expected(A + prior, b + prior @ self.start), A, b, steps)
 
-    def _solved(self, A: FloatArray, b: FloatArray) -> FloatArray:
-        """Minimise θᵀAθ/2 - bᵀθ over levels that are not below their floor."""
+    def _expected(self, A: FloatArray, b: FloatArray) -> FloatArray:
+        """Mean of every level under N(A⁻¹b, 2 A⁻¹), √θ being half of a t₃ of the start's scale.
+
+        The best fit of a level that is barely seen is often zero or less, and a filter that
+        believes in it stops listening for hours; what the level may still be is above zero.
+        """
         scale = self.start
         scaled = A * np.outer(scale, scale)
-        # Where the meters tell nothing of a shape, it keeps its start.
+        # Where the meters tell nothing of a shape, what is known of it beforehand stands.
         ridge = 1e-9 * max(float(np.trace(scaled)), 1e-300)
-        scaled = scaled + ridge * np.eye(len(scale))
-        factor = np.linalg.cholesky(scaled)
-        above = b * scale + ridge - scaled @ np.full(len(scale), FLOOR)
-        level, _ = optimize.nnls(factor.T, linalg.solve_triangular(factor, above, lower=True))
-        return np.asarray(scale * (FLOOR + level))
+        inverse = np.linalg.inv(scaled + ridge * np.eye(len(scale)))
+        best, spread = inverse @ (b * scale + ridge), np.sqrt(2.0 * np.diagonal(inverse))
+        largest = np.maximum(best, 0.0) + np.minimum(6.0 * spread, BEYOND)
+        level = largest[:, None] * GRID**2
+        fit = -0.5 * ((level - best[:, None]) / spread[:, None]) ** 2 - 2.0 * np.log1p(level / 3.0)
+        # Measured from the likeliest, so that not all weights vanish.
+        weight = np.exp(fit - fit.max(axis=1, keepdims=True))
+        mean = (weight * level).sum(axis=1) / weight.sum(axis=1)
+        return np.asarray(scale * np.maximum(mean, FLOOR))
 
 
-def of_loads(network: Network, window: int = WINDOW) -> Matching:
+def of_loads(network: Network, window: float = WINDOW) -> Matching:
     """Loads alone in proportion to their nominal power, all loads together, and the source."""
     sensitivity = Sensitivity(network)
     moves = sensitivity.renewed()
