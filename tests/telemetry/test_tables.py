@@ -99,6 +99,33 @@ def test_existing_telemetry_is_never_overwritten(written: Path):
         telemetry.write_raw(written, case())
 
 
+@pytest.mark.parametrize("there", [False, True])
+def test_an_interrupted_writer_leaves_nothing_that_can_be_run(
+    tmp_path: Path, there: bool, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "mine"
+    if there:
+        folder.mkdir()
+        (folder / "NOTES.md").write_text("ours")
+    write, calls = pq.write_table, iter(range(100))
+
+    def interrupted(*args: object, **kwargs: object) -> None:
+        if next(calls) == 7:
+            raise KeyboardInterrupt
+        write(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pq, "write_table", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            telemetry.write_raw(folder, case())
+    assert next(calls) == 8
+    assert [p.name for p in tmp_path.rglob("*")] == (["mine", "NOTES.md"] if there else [])
+    with pytest.raises(TableError, match="write it with pse_analysis"):
+        telemetry.read_raw(folder)
+    telemetry.write_raw(folder, case())
+    pd.testing.assert_frame_equal(telemetry.read_raw(folder).telemetry, case().telemetry)
+
+
 def test_missing_folder(tmp_path: Path):
     with pytest.raises(TableError, match=r"no raw folder .*none; expected telemetry/.*write_raw"):
         telemetry.read_raw(tmp_path / "none")

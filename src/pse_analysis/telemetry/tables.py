@@ -12,6 +12,7 @@ bytes.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
@@ -184,14 +185,14 @@ def _to_pandas(arrow: pa.Table) -> pd.DataFrame:
 
 
 def write_raw(folder: str | Path, raw: RawCase) -> None:
-    """Write a raw case into a folder that holds none yet.
+    """Write a raw case into a folder that holds none yet, whole or not at all.
 
     Raises
     ------
     TableError
         If the folder already holds telemetry, or a table breaks its schema.
     """
-    folder = Path(folder)
+    folder = Path(folder).resolve()
     if (folder / "telemetry").exists():
         raise TableError(
             f"{folder} already holds telemetry, which is never overwritten: choose another "
@@ -200,6 +201,29 @@ def write_raw(folder: str | Path, raw: RawCase) -> None:
     channels = check_channels(raw.channels, raw.model)
     telemetry = check("telemetry", raw.telemetry)
     check_known(telemetry, channels)
+    part = folder.with_name(f".{folder.name}.part")
+    # What a killed writer left is nobody's.
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        _write_folder(part, raw, channels, telemetry)
+        if folder.exists():
+            # Telemetry comes last: without it nothing reads the folder.
+            for path in [
+                p for p in part.rglob("*.parquet") if p.relative_to(part).parts[0] != "telemetry"
+            ]:
+                target = folder / path.relative_to(part)
+                target.parent.mkdir(exist_ok=True)
+                path.replace(target)
+            (part / "telemetry").replace(folder / "telemetry")
+        else:
+            part.replace(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_folder(
+    folder: Path, raw: RawCase, channels: pd.DataFrame, telemetry: pd.DataFrame
+) -> None:
     for table in OPTIONAL_TABLES:
         frame = getattr(raw, table)
         if frame is not None:
