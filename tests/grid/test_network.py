@@ -157,6 +157,13 @@ def spoilt(column: str, value: object, n: int = 14) -> np.ndarray:
         ("buses", {"kind": np.ones(14)}, "expected one slack bus, received 0"),
         ("buses", {"kind": np.full(14, 3)}, "expected one slack bus, received 14"),
         ("buses", {"kind": np.array([3, 7] + [1] * 12)}, "kind of bus '2' must be 1, 2 or 3"),
+        ("buses", {"kind": np.array([3, 259] + [1] * 12)}, "kind of bus '2'.*received 259"),
+        ("buses", {"kind": np.array([3, np.nan] + [1] * 12)}, "kind of bus '2'.*received nan"),
+        ("buses", {"kind": ["3", "PQ"] + ["1"] * 12}, "kind of bus '2'.*received 'PQ'"),
+        ("branches", {"x_pu": ["0,1"] * 20}, "x_pu of branch '1-2' must be a number; .*decimal"),
+        ("branches", {"in_service": ["true", ""] * 10}, "in_service of .*true or false; rec.* ''"),
+        ("branches", {"in_service": np.full(20, np.nan)}, "in_service of .*received nan"),
+        ("branches", {"to_bus": np.arange(20) % 14, "from_bus": [0] * 20}, "ends at the bus where"),
         ("buses", {"q_max_mvar": np.full(14, np.nan)}, "q_max_mvar of bus '1'.*inf where"),
         ("buses", {"name": ("1",) * 14}, "distinct names, '1' repeats"),
     ],
@@ -167,14 +174,54 @@ def test_impossible_grid_is_refused(table: str, columns: dict[str, object], expe
 
 
 def test_base_power_must_be_positive() -> None:
-    with pytest.raises(GridError, match="base_mva must be positive, received 0"):
+    with pytest.raises(GridError, match="base_mva must be positive and finite, received 0"):
         dataclasses.replace(library.load("ieee14"), base_mva=0.0)
+    with pytest.raises(GridError, match="base_mva must be positive and finite, received inf"):
+        dataclasses.replace(library.load("ieee14"), base_mva=np.inf)
+    tables = library.load("ieee14").to_tables()
+    with pytest.raises(GridError, match="base_mva must be a number, received '25 MVA'"):
+        Network.from_tables(**tables | {"network": tables["network"].assign(base_mva="25 MVA")})
+
+
+def test_a_branch_is_out_of_service_however_a_table_spells_it() -> None:
+    tables = library.load("ieee14").to_tables()
+    for words in (["True", "False"], ["yes", "NO"], [True, False], [1.0, 0.0], ["1", "0"]):
+        branches = tables["branches"].assign(in_service=words * 10)
+        network = Network.from_tables(**tables | {"branches": branches})
+        assert network.branches.in_service.tolist() == [True, False] * 10
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "spelt"),
+    [
+        ("branches", "tap", "tap_ratio"),
+        ("branches", "shift_rad", "shift_deg"),
+        ("branches", "in_service", "In_Service"),
+        ("buses", "p_load_mw", "p_laod_mw"),
+        ("buses", "p_load_mw", "p_load"),
+        ("buses", "vn_kv", "vn_kV"),
+    ],
+)
+def test_a_misspelt_column_is_refused_and_an_unrelated_one_is_not(
+    table: str, column: str, spelt: str
+) -> None:
+    tables = library.load("ieee14").to_tables()
+    frame = tables[table]
+    own = frame.assign(station="S", length_km=1.0, max_i_ka=1.0, q_gen_mvar=0.0)
+    own = own.drop(columns=["q_min_mvar", "q_max_mvar"], errors="ignore")
+    Network.from_tables(**tables | {table: own})
+    with pytest.raises(GridError, match=f"unknown column '{spelt}': did you mean '{column}'"):
+        Network.from_tables(**tables | {table: frame.rename(columns={column: spelt})})
 
 
 def test_branch_to_nowhere_names_the_bus() -> None:
     tables = library.load("ieee14").to_tables()
     tables["branches"].loc[2, "to_bus"] = "99"
-    with pytest.raises(GridError, match="to_bus '99' is no bus"):
+    with pytest.raises(GridError, match=r"to_bus '99' is no bus; expected .* as 1, 2"):
+        Network.from_tables(**tables)
+    tables = library.load("ieee14").to_tables()
+    tables["buses"].loc[3, "name"] = "3"
+    with pytest.raises(GridError, match="name '3' repeats"):
         Network.from_tables(**tables)
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import enum
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import GridError
+from pse_analysis.vocabulary import shown
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -97,7 +99,13 @@ class Branches:
     in_service: npt.NDArray[np.bool_]
 
 
-_INTEGER = {"from_bus", "to_bus"}
+_TYPES: Mapping[str, type[np.generic]] = MappingProxyType(
+    {"from_bus": np.int64, "to_bus": np.int64, "in_service": np.bool_, "kind": np.int8}
+)
+_CODES: Mapping[str, tuple[tuple[int, ...], str]] = MappingProxyType(
+    {"in_service": ((0, 1), "true or false"), "kind": ((1, 2, 3), "1, 2 or 3: PQ, PV or slack")}
+)
+_WORDS = MappingProxyType({"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0})
 
 OPTIONAL: Mapping[str, float | bool] = MappingProxyType(
     {
@@ -118,6 +126,9 @@ OPTIONAL: Mapping[str, float | bool] = MappingProxyType(
 )
 """Value of the columns of buses and branches that a table may leave out."""
 
+ALIKE = 0.85
+"""Similarity of names from which one is taken for the other misspelt."""
+
 
 def branch_names(branches: pd.DataFrame) -> list[str]:
     """Names by their ends, with a number behind the second of parallel ones and on."""
@@ -133,18 +144,64 @@ def freeze(columns: Columns) -> None:
         if field.name == "name":
             object.__setattr__(columns, "name", tuple(map(str, columns.name)))
             continue
-        kind: npt.DTypeLike = np.float64
-        if field.name in _INTEGER:
-            kind = np.int64
-        elif field.name == "in_service":
-            kind = np.bool_
-        elif field.name == "kind":
-            kind = np.int8
-        array = np.array(getattr(columns, field.name), dtype=kind)
-        if array.shape != (length,):
+        values = np.asarray(getattr(columns, field.name))
+        if values.shape != (length,):
             raise GridError(
                 f"{type(columns).__name__}.{field.name}: expected {length} values, one per name, "
-                f"received shape {array.shape}"
+                f"received shape {values.shape}"
             )
+        array = _numbers(columns, field.name, values).astype(_TYPES.get(field.name, np.float64))
         array.flags.writeable = False
         object.__setattr__(columns, field.name, array)
+
+
+def _numbers(columns: Columns, field: str, values: npt.NDArray[Any]) -> FloatArray:
+    """The values as numbers, also those that a table spells as text."""
+    codes, wanted = _CODES.get(field, ((), "a number"))
+    numbers = np.full(values.shape, np.nan)
+    refused = np.zeros(values.shape, dtype=bool)
+    if values.dtype.kind in "biuf":
+        numbers[:] = values
+    else:
+        for at, value in enumerate(values):
+            word = str(value).strip().lower()
+            try:
+                numbers[at] = _WORDS[word] if codes and word in _WORDS else float(value)
+            except (TypeError, ValueError):
+                refused[at] = True
+    if codes:
+        refused |= ~np.isin(numbers, codes)
+    if refused.any():
+        at = int(np.argmax(refused))
+        element = "branch" if isinstance(columns, Branches) else "bus"
+        comma = "," in str(values[at])
+        raise GridError(
+            f"{field} of {element} {columns.name[at]!r} must be {wanted}; received {shown(values[at])}"
+            + ("; read decimal commas with pandas.read_csv(decimal=',')" if comma else "")
+        )
+    return numbers
+
+
+def check_spelling(table: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse a column that looks like one that is known and not given.
+
+    Raises
+    ------
+    GridError
+        With both names; a column that resembles none is the user's own.
+    """
+    given = [str(name) for name in given]
+    absent = [name for name in known if name not in given]
+    for column in given:
+        word = column.strip().lower()
+        for name in absent:
+            first = name.split("_")[0]
+            if (
+                difflib.SequenceMatcher(None, word, name).ratio() >= ALIKE
+                or (len(first) > 2 and word.split("_")[0] == first)
+                or (len(word) > 2 and name.startswith(word))
+            ):
+                raise GridError(
+                    f"grid table {table!r}: unknown column {column!r}: did you mean {name!r}? "
+                    "Rename it (with that unit), or leave it out if it is something else"
+                )

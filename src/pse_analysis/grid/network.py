@@ -28,8 +28,10 @@ from pse_analysis.grid.elements import (
     Buses,
     BusKind,
     branch_names,
+    check_spelling,
     freeze,
 )
+from pse_analysis.vocabulary import shown
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -65,8 +67,10 @@ class Network:
         freeze(self.buses)
         freeze(self.branches)
         bus, branch = self.buses, self.branches
-        if not self.base_mva > 0:
-            raise GridError(f"{self.name}: base_mva must be positive, received {self.base_mva}")
+        if not 0 < self.base_mva < np.inf:
+            raise GridError(
+                f"{self.name}: base_mva must be positive and finite, received {self.base_mva}"
+            )
         for table, names in (("buses", bus.name), ("branches", branch.name)):
             if len(set(names)) != len(names):
                 repeated = next(n for n in names if names.count(n) > 1)
@@ -78,6 +82,13 @@ class Network:
             raise GridError(
                 f"{self.name}: branch ends must lie in 0…{self.n_bus - 1}, received "
                 f"{ends.min()}…{ends.max()}"
+            )
+        loops = branch.from_bus == branch.to_bus
+        if loops.any():
+            culprit = branch.name[int(np.argmax(loops))]
+            raise GridError(
+                f"{self.name}: branch {culprit!r} ends at the bus where it begins: leave it out, "
+                "or mend its ends"
             )
         short = branch.in_service & (branch.r_pu == 0) & (branch.x_pu == 0)
         if short.any():
@@ -99,7 +110,6 @@ class Network:
         for of, column, good, wanted in (
             (branch, "tap", branch.tap > 0, "positive: 1 where there is no transformer"),
             (bus, "vn_kv", bus.vn_kv > 0, "positive"),
-            (bus, "kind", np.isin(bus.kind, list(BusKind)), "1, 2 or 3: PQ, PV or slack"),
             (bus, "q_min_mvar", ~np.isnan(bus.q_min_mvar), "a number: -inf where none is known"),
             (bus, "q_max_mvar", ~np.isnan(bus.q_max_mvar), "a number: inf where none is known"),
         ):
@@ -321,8 +331,12 @@ class Network:
         Raises
         ------
         GridError
-            On a missing column or a branch that ends at an unknown bus.
+            On a missing or misspelt column, a value that is no number, or a branch that ends at an
+            unknown bus.
         """
+        for table, given_table, kind in (("buses", buses, Buses), ("branches", branches, Branches)):
+            known = [f.name for f in dataclasses.fields(kind) if f.name != "name"]
+            check_spelling(table, given_table.columns, known)
         own = {f.name for f in dataclasses.fields(Buses)}
         given = {k: v for k, v in OPTIONAL.items() if k in own and k not in buses}
         buses = buses.assign(**given)
@@ -346,6 +360,9 @@ class Network:
         if len(network) != 1:
             raise GridError(f"grid table 'network': expected one row, received {len(network)}")
         names = tuple(buses["name"].astype(str))
+        if len(set(names)) != len(names):
+            repeated = next(n for n in names if names.count(n) > 1)
+            raise GridError(f"grid table 'buses': name {repeated!r} repeats: give each bus its own")
         position = {n: i for i, n in enumerate(names)}
         ends: dict[str, list[int]] = {}
         for end in ("from_bus", "to_bus"):
@@ -354,7 +371,7 @@ class Network:
             if unknown:
                 raise GridError(
                     f"grid table 'branches': {end} {unknown[0]!r} is no bus; expected a name of "
-                    "grid table 'buses'"
+                    f"grid table 'buses', as {', '.join(names[:6])}"
                 )
             ends[end] = [position[b] for b in labels]
         bus_columns = {
@@ -365,9 +382,16 @@ class Network:
             for f in dataclasses.fields(Branches)
             if f.name not in ("name", "from_bus", "to_bus")
         }
+        try:
+            base_mva = float(network["base_mva"].iloc[0])
+        except (TypeError, ValueError) as error:
+            raise GridError(
+                "grid table 'network': base_mva must be a number, received "
+                f"{shown(network['base_mva'].iloc[0])}"
+            ) from error
         return cls(
             name=str(network["name"].iloc[0]),
-            base_mva=float(network["base_mva"].iloc[0]),
+            base_mva=base_mva,
             buses=Buses(name=names, **bus_columns),
             branches=Branches(
                 name=tuple(branches["name"].astype(str)),
