@@ -176,7 +176,8 @@ def _numbers(columns: Columns, field: str, values: npt.NDArray[Any]) -> FloatArr
         element = "branch" if isinstance(columns, Branches) else "bus"
         comma = "," in str(values[at])
         raise GridError(
-            f"{field} of {element} {columns.name[at]!r} must be {wanted}; received {shown(values[at])}"
+            f"{field} of {element} {columns.name[at]!r} must be {wanted}; received "
+            f"{shown(values[at])}"
             + ("; read decimal commas with pandas.read_csv(decimal=',')" if comma else "")
         )
     return numbers
