@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import integrate
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import Method, matching
@@ -138,20 +139,46 @@ def test_a_level_that_is_not_seen_keeps_its_scale() -> None:
 
 
 def test_a_level_is_the_mean_of_what_it_may_be() -> None:
-    """Beside 4e6 draws from the posterior of a level whose best fit lies below zero."""
+    """Beside an integral over the posterior of a level whose best fit lies below zero."""
     made = Matching(lambda _voltage: (), np.array([0.5]), window=1e9)
     memory = made.begin()
     for _ in range(5):
-        memory = made.learn(memory, 0.4 * np.ones((1, 1, 1)), np.array([0.3]))
+        memory = made.learn(memory, np.full((1, 1, 1), 0.9), np.array([0.3]))
     # The start counts as one more step.
     A = memory.A[0, 0] * (1.0 + 1.0 / 5.0)
     best = (memory.b[0] + memory.A[0, 0] / 5.0 * 0.5) / A
     assert best < 0
-    root = np.sqrt(0.5) * np.abs(np.random.default_rng(SEED).standard_t(3, 4_000_000))
-    level = root[root**2 < best + 50.0] ** 2
-    weight = np.exp(-0.25 * A * (level - best) ** 2)
-    expected = (weight * level).sum() / weight.sum()
-    np.testing.assert_allclose(memory.level[0], expected, rtol=0.01)
+    assert best / np.sqrt(2.0 / A) > -3.0
+
+    def moment(power: int) -> float:
+        return integrate.quad(
+            lambda root: (
+                root**power * np.exp(-0.25 * A * (root**2 - best) ** 2) / (1.0 + root**2 / 0.5)
+            ),
+            0.0,
+            np.sqrt(4.5),
+        )[0]
+
+    np.testing.assert_allclose(memory.level[0], moment(2) / moment(0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("q", [1e-5, 1e-3, 1e-2])
+def test_a_filter_with_an_estimated_level_covers_the_truth(q: float) -> None:
+    """A walk of which a meter of variance 1 sees little or nothing, under a start of 0.01."""
+    rng = np.random.default_rng(SEED)
+    inside = []
+    for _ in range(20):
+        made = Matching(lambda _voltage: (), np.array([0.01]))
+        memory, x, estimate, P = made.begin(), 0.0, 0.0, 1.0
+        for k in range(200):
+            x += np.sqrt(q) * rng.normal()
+            P += memory.level[0]
+            S, eta = P + 1.0, x + rng.normal() - estimate
+            memory = made.learn(memory, np.full((1, 1, 1), 1.0 / S), np.array([eta / np.sqrt(S)]))
+            estimate, P = estimate + P / S * eta, P / S
+            if k >= 20:
+                inside.append(abs(estimate - x) < 2.0 * np.sqrt(P))
+    assert np.mean(inside) > 0.93
 
 
 @pytest.mark.parametrize(("start", "window"), [(np.array([0.0, 1.0]), 5), (np.ones(2), 0)])

@@ -31,8 +31,9 @@ Innovations are then as old on average as in a window of 36, three hours of five
 """
 FLOOR = 1e-4
 """Smallest share of its start that a level may sink to: no movement is ever ruled out."""
-BEYOND = 100.0
-"""How far above its best fit a level is looked for, over its start."""
+BEYOND = 9.0
+"""How far above its best fit a level is looked for, over that and its start: σ is at most √10 of
+the larger."""
 GRID = (np.arange(64) + 0.5) / 64
 """Where √θ is tried, over the largest that is credible."""
 
@@ -115,20 +116,21 @@ class Matching:
         return Matched(self._expected(A + prior, b + prior @ self.start), A, b, steps)
 
     def _expected(self, A: FloatArray, b: FloatArray) -> FloatArray:
-        """Mean of every level under N(A⁻¹b, 2 A⁻¹), √θ being half of a t₃ of the start's scale.
+        """Mean of every level under N(A⁻¹b, 2 A⁻¹), √θ being half-Cauchy of the start's scale.
 
         The best fit of a level that is barely seen is often zero or less, and a filter that
         believes in it stops listening for hours; what the level may still be is above zero.
         """
         scale = self.start
         scaled = A * np.outer(scale, scale)
-        # Where the meters tell nothing of a shape, what is known of it beforehand stands.
+        # Where the meters tell nothing of a shape, its start is the best fit.
         ridge = 1e-9 * max(float(np.trace(scaled)), 1e-300)
         inverse = np.linalg.inv(scaled + ridge * np.eye(len(scale)))
         best, spread = inverse @ (b * scale + ridge), np.sqrt(2.0 * np.diagonal(inverse))
-        largest = np.maximum(best, 0.0) + np.minimum(6.0 * spread, BEYOND)
+        above = np.maximum(best, 0.0)
+        largest = above + np.minimum(6.0 * spread, BEYOND * (1.0 + above))
         level = largest[:, None] * GRID**2
-        fit = -0.5 * ((level - best[:, None]) / spread[:, None]) ** 2 - 2.0 * np.log1p(level / 3.0)
+        fit = -0.5 * ((level - best[:, None]) / spread[:, None]) ** 2 - np.log1p(level)
         # Measured from the likeliest, so that not all weights vanish.
         weight = np.exp(fit - fit.max(axis=1, keepdims=True))
         mean = (weight * level).sum(axis=1) / weight.sum(axis=1)
