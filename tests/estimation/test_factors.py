@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pse_analysis.estimation.factors import Columns, Root, squared_inverse
 
 from pse_analysis.estimation.conditioning import Moments, Prior
+from pse_analysis.estimation.factors import Columns, Root, cholesky, squared_inverse
 from pse_analysis.estimation.robust import Suspicion
 
 SEED = 3
@@ -72,3 +72,15 @@ def test_measurements_of_the_state_itself_need_no_inverse() -> None:
         prior, np.ones(7), noise, verdict
     )
     np.testing.assert_allclose(seen[0], np.diagonal(np.linalg.inv(own + np.diag(noise))))
+
+
+def test_what_is_certain_does_not_stop_a_factorisation() -> None:
+    """A row of zeros, a little below them by rounding, as that of an angle nothing moves."""
+    S = covariance(5)
+    S[2] = S[:, 2] = 0.0
+    S[2, 2] = -1e-25
+    root = cholesky(S)
+    np.testing.assert_allclose(root @ root.T, S, atol=1e-10)
+    S[2, 2] = -1e-3
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        cholesky(S)

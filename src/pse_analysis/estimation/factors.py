@@ -126,7 +126,8 @@ def cholesky(matrix: FloatArray) -> FloatArray:
     """Lower Cholesky factor of a covariance that rounding may have made a little indefinite.
 
     Above the diagonal the result is zero. If the factorisation fails, the diagonal is raised by the
-    smallest of 1e-14, 1e-12, … 1e-6 of itself that mends it.
+    smallest of 1e-14, 1e-12, … 1e-6 of itself that mends it, and what is certain by so much of a
+    millionth of the largest.
 
     Parameters
     ----------
@@ -143,7 +144,9 @@ def cholesky(matrix: FloatArray) -> FloatArray:
     for power in (-14, -12, -10, -8, -6):
         if not failed:
             return np.asarray(found)
-        raised = matrix + np.diag(10.0**power * np.diagonal(matrix))
+        diagonal = np.diagonal(matrix)
+        floor = np.maximum(diagonal, 1e-6 * diagonal.max(initial=0.0))
+        raised = matrix + np.diag(10.0**power * floor)
         found, failed = lapack.dpotrf(raised.T, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("covariance is not positive definite")
