@@ -186,16 +186,27 @@ class Deletion:
         across = self._columns(out)
         inverse = _inverse(across[out])
         own, error = np.diagonal(inverse), inverse @ self._weighted[out]
-        seen = np.flatnonzero(rest.diagonal > self._floor)
-        swept = across[seen] @ (inverse / np.sqrt(own))
-        worth = (rest.weighted[seen, None] + swept * (error / np.sqrt(own))) ** 2
-        gain = worth / (rest.diagonal[seen, None] + swept**2) - error**2 / own
-        gain[np.isin(seen, out)] = -np.inf
-        j, i = np.unravel_index(gain.argmax(), gain.shape)
+        root = np.sqrt(own)
+        # What is left out itself, or seen by nothing else, is worth nothing.
+        weighted, diagonal = rest.weighted.copy(), rest.diagonal.copy()
+        unseen = diagonal <= self._floor
+        unseen[out] = True
+        weighted[unseen], diagonal[unseen] = 0.0, 1.0
+        swept = across @ (inverse / root)
+        swept[unseen] = 0.0
+        gain = swept * (error / root)
+        gain += weighted[:, None]
+        gain *= gain
+        swept *= swept
+        swept += diagonal[:, None]
+        gain /= swept
+        gain -= error**2 / own
+        gain[unseen] = -np.inf
+        j, i = divmod(int(gain.argmax()), len(out))
         if gain[j, i] <= SLIGHT * price:
             return None
         other = out.copy()
-        other[i] = seen[j]
+        other[i] = j
         return other
 
 

@@ -98,6 +98,7 @@ def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Mom
     # Row by row here: column by column, as BLAS reads it, in what is returned.
     cross, own = np.zeros((m, len(prior.s))), np.zeros((m, m))
     linear, entry, curved = spread.linear, spread.entry, spread.curved
+    first = isinstance(linear, slice) and linear.start == 0
     if len(spread.shift):
         root = 1.0 / np.sqrt(spread.square)
         if n == len(prior.s):
@@ -107,10 +108,10 @@ def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Mom
         cross[curved] = product.T
         both = np.hstack([spread.odd, _bent(prior, spread, scaling, alpha)])
         own[block(curved, curved)] = blas.dsyrk(root**2, both.T, trans=1, lower=1).T
-        own[block(curved, linear)] = product[entry].T
+        if not first:
+            own[block(curved, linear)] = product[entry].T
     cross[linear] = prior.P[entry]
     own[linear] = cross[:, entry].T
-    first = isinstance(linear, slice) and linear.start == 0
     return Moments(spread.mean, own.T, cross.T, alpha, entry if first else None)
 
 
