@@ -182,6 +182,24 @@ UNITS: MappingProxyType[Quantity, tuple[str, ...]] = MappingProxyType(
 )
 """Units a channel of each quantity may be given in; the first is the one its name carries."""
 
+_UNIT_NAMES: MappingProxyType[str, str] = MappingProxyType(
+    {
+        "p.u.": "pu",
+        "p.u": "pu",
+        "deg": "degree",
+        "degrees": "degree",
+        "°": "degree",
+        "radian": "rad",
+        "radians": "rad",
+    }
+)
+
+
+def plain_unit(text: str) -> str:
+    """A unit as `UNITS` spells it, from the ways in which people do."""
+    unit = text.strip().lower()
+    return _UNIT_NAMES.get(unit, unit)
+
 
 def severity(reasons: npt.ArrayLike) -> npt.NDArray[np.int8]:
     """Largest severity among the reasons of each sample.

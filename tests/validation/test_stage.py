@@ -10,6 +10,7 @@ import pytest
 
 from pse_analysis import vocabulary
 from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.grid import library
 from pse_analysis.validation import Rule, ValidateParams, validate
 from pse_analysis.vocabulary import Flag, Reason
 
@@ -285,12 +286,45 @@ def test_later_rules_override_field_by_field() -> None:
     [
         ({"source": "pmu"}, "matches no channel"),
         ({"unit": "kv", "lower": 1.0}, "does not convert to 'mw'"),
+        (
+            {"unit": "pu", "lower": 1.0},
+            "does not convert to 'mw', .* without the grid.*pass model=",
+        ),
         ({"lower": 200.0}, "swap them"),
+        ({"k": -3.0}, "expected -1 … 2, received -3.0"),
+        ({"amplitude": np.inf}, "amplitude must be finite and > 0, received inf"),
     ],
 )
 def test_rules_that_cannot_hold_say_so(rule: dict[str, object], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         validate(telemetry(walk(5)), channels(), ValidateParams((Rule(**rule),)))
+
+
+@pytest.mark.parametrize("unit", ["kv", "kV", " KV "])
+def test_limits_may_be_stated_in_the_unit_of_the_plant(unit: str) -> None:
+    network = library.load("ieee33")
+    voltage = channels(quantity="vm_pu", element="bus/6", unit="pu", lower=np.nan, upper=np.nan)
+    value = 1.0 + 0.001 * walk(40)
+    value[10], value[20] = 0.9, 1.1
+    params = ValidateParams((Rule(unit=unit, lower=0.95 * 12.66, upper=1.05 * 12.66),))
+    found = np.array(validate(telemetry(value), voltage, params, model=network)["reasons"])
+    assert np.flatnonzero(found & Reason.LIMIT).tolist() == [10, 20]
+
+
+def test_a_channel_that_limits_reject_as_a_whole_is_shown_and_stops_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    both = pd.concat([channels(), channels(channel="other")], ignore_index=True)
+    frame = pd.concat([telemetry(walk(40)), telemetry(walk(40)).assign(channel="other")])
+    params = ValidateParams((Rule(channel="other", lower=20_000.0, upper=23_000.0),))
+    validate(frame, both)
+    assert not caplog.records
+    out = validate(frame.reset_index(drop=True), both, params)
+    assert (out["flag"] == Flag.BAD).sum() == 40
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert "other: all 40 samples lie outside the limits 20000.0 … 23000.0 mw, e.g. 19" in (
+        caplog.text.replace("e.g. 20", "e.g. 19")
+    )
 
 
 def test_a_prior_that_rejects_everything_is_reported() -> None:

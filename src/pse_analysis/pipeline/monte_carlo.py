@@ -107,7 +107,9 @@ def run_task(task: Task) -> pd.DataFrame:
     drawn = simulate(
         network, _curves(task.curves), study, dataclasses.replace(own.simulate, seed=task.seed)
     )
-    checked = validate(drawn.telemetry, drawn.channels, own.validate, history_end=study.start)
+    checked = validate(
+        drawn.telemetry, drawn.channels, own.validate, history_end=study.start, model=network
+    )
     wanted = {method.variant for method in own.estimate.methods}
     variants = tuple(v for v in own.align.variants if v.name in wanted)
     aligned = align(

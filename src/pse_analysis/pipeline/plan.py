@@ -58,7 +58,14 @@ STAGES = (
         "validate",
         "pse_analysis.validation",
         keys=("study", "validate"),
-        raw=("telemetry", "channels.parquet", "sample_truth.parquet", "faults.parquet"),
+        raw=(
+            "telemetry",
+            "grid",
+            "machine.parquet",
+            "channels.parquet",
+            "sample_truth.parquet",
+            "faults.parquet",
+        ),
     ),
     Stage(
         "align",

@@ -129,7 +129,11 @@ def _validate(job: Job) -> None:
     raw = read_raw(job.raw)
     job.progress(1, 4, "checking samples")
     validated = validate(
-        raw.telemetry, raw.channels, params.validate, history_end=params.study.start
+        raw.telemetry,
+        raw.channels,
+        params.validate,
+        history_end=params.study.start,
+        model=raw.model,
     )
     job.progress(2, 4, "writing")
     write_table(job.output / "validated.parquet", validated, "validated")

@@ -15,19 +15,10 @@ from pse_analysis.grid.network import Network
 from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.telemetry.channels import check_channels, check_known, check_shunts, suggest
 from pse_analysis.telemetry.tables import RawCase
-from pse_analysis.vocabulary import UNITS, Quantity, check, shown
+from pse_analysis.vocabulary import UNITS, Quantity, check, plain_unit, shown
 
 log = logging.getLogger(__name__)
 
-_UNIT_NAMES = {
-    "p.u.": "pu",
-    "p.u": "pu",
-    "deg": "degree",
-    "degrees": "degree",
-    "°": "degree",
-    "radian": "rad",
-    "radians": "rad",
-}
 _CHANNEL_DEFAULTS: Mapping[str, object] = {
     "side": "",
     "lower": np.nan,
@@ -174,8 +165,7 @@ def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
         given = filled[name] if name in filled.columns else pd.Series(np.nan, filled.index)
         filled[name] = given.where(given.notna(), default) if given.notna().any() else default
     if "unit" in filled.columns:
-        unit = filled["unit"].astype(str).str.strip().str.lower()
-        filled["unit"] = unit.map(lambda u: _UNIT_NAMES.get(u, u)).astype(object)
+        filled["unit"] = filled["unit"].astype(str).map(plain_unit).astype(object)
     for name in ("sigma", "lower", "upper", "period_s"):
         if name in filled.columns and pd.api.types.is_numeric_dtype(filled[name].dtype):
             filled[name] = filled[name].astype(np.float64)

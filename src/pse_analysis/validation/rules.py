@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,8 +12,9 @@ from typing import Any, Literal
 import pandas as pd
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.validation.thresholds import DEFAULT_AMPLITUDE
-from pse_analysis.vocabulary import Quantity
+from pse_analysis.vocabulary import UNITS, Quantity, plain_unit
 
 CHECKS = ("limits", "increment", "extrapolation", "stuck", "time")
 
@@ -44,7 +46,8 @@ class Rule:
         and backward stamps are always flagged). Default: all but ``increment``; the extrapolation
         check is the first-increment check, and called so, where the history shows no sure gain.
     unit : str
-        Unit of ``lower``, ``upper`` and ``increment``. Default: each channel's own.
+        Unit of ``lower``, ``upper`` and ``increment``, any that the quantity has. Default: each
+        channel's own, which after `pse_analysis.telemetry.ingest` is that of its quantity's name.
     lower, upper : float
         Limits in place of those in the table of channels. A voltage magnitude must be above 0
         whatever they say.
@@ -64,7 +67,7 @@ class Rule:
     quantile : float
         k = γ/σ where the criterion is ``fixed``.
     k : "optimal", "scan" or float
-        Coefficient of the extrapolation.
+        Coefficient of the extrapolation, −1 … 2.
     confirm : int
         Samples that must agree with a flagged one before a step is accepted.
     stuck : int
@@ -115,8 +118,10 @@ class Rule:
             ("cost_miss", 0.0), ("quantile", 0.0),
         ):  # fmt: skip
             value = getattr(self, name)
-            if value is not None and not value > low:
-                raise ParameterError(f"[validate.rules] {name} must be > 0, received {value}")
+            if value is not None and not low < value < math.inf:
+                raise ParameterError(
+                    f"[validate.rules] {name} must be finite and > 0, received {value}"
+                )
         for name in ("q", "q_max"):
             value = getattr(self, name)
             if value is not None and not 0.0 <= value <= 1.0:
@@ -127,6 +132,11 @@ class Rule:
             value = getattr(self, name)
             if value is not None and value < low:
                 raise ParameterError(f"[validate.rules] {name} must be ≥ {low}, received {value}")
+        if isinstance(self.k, float | int) and not -1.0 <= self.k <= 2.0:
+            raise ParameterError(
+                f"[validate.rules] k is the share of the last increment that is expected again: "
+                f"expected -1 … 2, received {self.k}"
+            )
         if self.stuck == 1:
             raise ParameterError(
                 "[validate.rules] stuck = 1 would flag every sample: "
@@ -179,7 +189,9 @@ class ValidateParams:
     rules: tuple[Rule, ...] = ()
 
 
-def resolve(channels: pd.DataFrame, params: ValidateParams) -> list[Rule]:
+def resolve(
+    channels: pd.DataFrame, params: ValidateParams, model: Model | None = None
+) -> list[Rule]:
     """The rule in force for each channel, limits and increments in the channel's own unit.
 
     Parameters
@@ -187,6 +199,8 @@ def resolve(channels: pd.DataFrame, params: ValidateParams) -> list[Rule]:
     channels : DataFrame
         Of schema ``channels``.
     params : ValidateParams
+    model : Network or Machine, optional
+        What turns kV or A into p.u.
 
     Returns
     -------
@@ -217,7 +231,7 @@ def resolve(channels: pd.DataFrame, params: ValidateParams) -> list[Rule]:
                 if f.name in _PATTERNS or f.name == "unit" or value is None:
                     continue
                 if f.name in _IN_UNIT:
-                    value = value * _scale(rule.unit, str(row.unit), channel)
+                    value = value * _scale(rule.unit, row._asdict(), model)
                 values[f.name] = value
         if voltage and not (values["lower"] or 0.0) > 0.0:
             values["lower"] = LEAST_VOLTAGE
@@ -241,12 +255,20 @@ def _number(value: Any) -> float | None:
     return None if pd.isna(value) else float(value)
 
 
-def _scale(unit: str | None, own: str, channel: str) -> float:
-    if unit is None or unit == own:
+def _scale(unit: str | None, row: Mapping[str, Any], model: Model | None) -> float:
+    """What a number in a rule's unit is multiplied by to be in the channel's own."""
+    own = str(row["unit"])
+    given = own if unit is None else plain_unit(unit)
+    if given == own:
         return 1.0
-    if (unit, own) not in SCALES:
+    if (given, own) in SCALES:
+        return SCALES[given, own]
+    if given not in UNITS[Quantity(row["quantity"])] or model is None:
         raise ParameterError(
-            f"[validate.rules] unit {unit!r} does not convert to {own!r}, the unit of {channel}: "
-            f"state the rule in {own!r}"
+            f"[validate.rules] unit {unit!r} does not convert to {own!r}, the unit of "
+            f"{row['channel']}{'' if model else ', without the grid'}: state the rule in {own!r}"
+            f"{'' if model else ', or pass model='}"
         )
-    return SCALES[unit, own]
+    both = pd.DataFrame([row, row]).assign(unit=[given, own])
+    scale = SensorLayout.from_channels(both, model).scale
+    return float(scale[0] / scale[1])

@@ -12,6 +12,7 @@ import pandas as pd
 
 from pse_analysis import vocabulary
 from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.measurement import Model
 from pse_analysis.validation import extrapolation
 from pse_analysis.validation.block import RULED_OUT, Criteria, screen
 from pse_analysis.validation.criteria import decide
@@ -43,6 +44,7 @@ def validate(
     params: ValidateParams | None = None,
     *,
     history_end: datetime | None = None,
+    model: Model | None = None,
 ) -> pd.DataFrame:
     """Flag the samples of a telemetry table; none is deleted and none is overwritten.
 
@@ -58,6 +60,8 @@ def validate(
     history_end : datetime, optional
         Samples stamped and arrived before it are the history that σ, k and the usual delay are
         learnt from. Without it only stated thresholds are applied.
+    model : Network or Machine, optional
+        Needed where a rule is stated in kV or A and its channel in p.u., or the reverse.
 
     Returns
     -------
@@ -71,15 +75,16 @@ def validate(
     TableError
         If a sample's channel is not in ``channels``.
     ParameterError
-        If a rule fits no channel, or leads to rejecting every sample.
+        If a rule fits no channel, or its prior and costs lead to rejecting every sample.
 
     Notes
     -----
     From ``history_end`` on, flags depend on samples up to their own only; but a stamp that has
-    jumped ahead is known by the next one, well before the time it claims.
+    jumped ahead is known by the next one, well before the time it claims. One bad channel stops
+    nothing: where limits reject every sample of a channel, a warning is logged.
     """
     params = ValidateParams() if params is None else params
-    rules = resolve(channels, params)
+    rules = resolve(channels, params, model)
     code = _channel_code(telemetry, channels)
     trial = telemetry["trial"].to_numpy()
     seq = telemetry["seq"].to_numpy()
@@ -117,6 +122,8 @@ def validate(
             reasons, backward, statistic, threshold,
         )  # fmt: skip
 
+    _warn_of_limits(channels, rules, lane_channel[stamps.lane], value, reasons)
+
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
     out = telemetry.copy(deep=False)
@@ -127,6 +134,26 @@ def validate(
     usable = vocabulary.usable(out["flag"].to_numpy())
     out["corrected"] = np.where(usable, telemetry["value"].to_numpy(dtype=float), np.nan)
     return vocabulary.check("validated", out)
+
+
+def _warn_of_limits(
+    channels: pd.DataFrame,
+    rules: list[Rule],
+    channel: Ints,
+    value: Array,
+    reasons: npt.NDArray[np.int32],
+) -> None:
+    """Say which channels have no sample inside their limits: mostly limits in another unit."""
+    n = len(channels)
+    finite = np.bincount(channel[np.isfinite(value)], minlength=n)
+    outside = np.bincount(channel[(reasons & Reason.LIMIT) != 0], minlength=n)
+    for at in np.flatnonzero((finite > 0) & (outside >= finite)):
+        log.warning(
+            "%s: all %d samples lie outside the limits %s … %s %s, e.g. %.4g, and none is used: "
+            "check limits and unit of the channel, and those of [validate.rules]",
+            *(rules[at].channel, outside[at], rules[at].lower, rules[at].upper),
+            *(channels["unit"].iloc[at], value[(channel == at) & np.isfinite(value)][0]),
+        )
 
 
 def _screen_lanes(
