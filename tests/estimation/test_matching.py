@@ -191,3 +191,23 @@ def test_only_the_kalman_filter_estimates_its_noise_from_innovations() -> None:
     assert Method("kf", "kalman", noise="innovation").noise == "innovation"
     with pytest.raises(ParameterError, match="drop them"):
         Method("f", "ukf", noise="innovation")
+
+
+def test_sizes_of_loads_may_come_from_their_meters() -> None:
+    buses = NETWORK.buses
+    nothing = np.zeros(33)
+    bare = dataclasses.replace(
+        NETWORK, buses=dataclasses.replace(buses, p_load_mw=nothing, q_load_mvar=nothing)
+    )
+    usual = np.concatenate([NETWORK.p_nominal_pu, NETWORK.q_nominal_pu])
+    voltage = np.ones(33, dtype=complex)
+    expected = matching.of_loads(NETWORK).halves(voltage)
+    for half, same in zip(matching.of_loads(bare, usual).halves(voltage), expected, strict=True):
+        np.testing.assert_allclose(half, same)
+    # What the tables say counts more than what was read.
+    for half, same in zip(
+        matching.of_loads(NETWORK, 2 * usual).halves(voltage), expected, strict=True
+    ):
+        np.testing.assert_allclose(half, same)
+    with pytest.raises(ParameterError, match="how large the loads are"):
+        matching.of_loads(bare)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import ParameterError, TableError
@@ -27,10 +28,12 @@ from pse_analysis.estimation.records import Record, record
 from pse_analysis.estimation.wls import state_columns, tracking_wls
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
-from pse_analysis.measurement import Model, SensorLayout
+from pse_analysis.measurement import BUS, Model, P, Q, SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.validation.adaptive import AdaptiveParams
 from pse_analysis.vocabulary import check
+
+FloatArray = npt.NDArray[np.float64]
 
 __all__ = [
     "EstimateParams",
@@ -156,7 +159,9 @@ def _build_plain(
     if method.filter == "wls":
         return tracking_wls(method.name, network, layout)
     if method.noise == "innovation":
-        noise: process.ProcessNoise | matching.Matching = matching.of_loads(network)
+        noise: process.ProcessNoise | matching.Matching = matching.of_loads(
+            network, _usual_injections(history, layout, network)
+        )
     else:
         noise = known = _known_noise(method, network, layout, study, history)
     if method.filter in ("ukf", "ekf"):
@@ -194,6 +199,17 @@ def _known_noise(
         history, layout, network, study.step_s, source=method.source_sigma
     )
     return process.load_noise(network, learnt)
+
+
+def _usual_injections(history: Record, layout: SensorLayout, network: Network) -> FloatArray:
+    """Mean of the metered [P; Q] of every bus before the study, NaN where none is. (2N,) [p.u.]"""
+    out = np.full(2 * network.n_bus, np.nan)
+    read = history.available & history.fresh
+    for q, offset in ((P, 0), (Q, network.n_bus)):
+        for row in np.flatnonzero((layout.quantity == q) & (layout.side == BUS)):
+            if read[:, row].any():
+                out[offset + layout.position[row]] = history.z[read[:, row], row].mean()
+    return out
 
 
 def _reach(history: Record, layout: SensorLayout, step_s: float) -> float:

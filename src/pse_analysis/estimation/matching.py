@@ -137,15 +137,42 @@ class Matching:
         return np.asarray(scale * np.maximum(mean, FLOOR))
 
 
-def of_loads(network: Network, window: float = WINDOW) -> Matching:
-    """Loads alone in proportion to their nominal power, all loads together, and the source."""
+def of_loads(
+    network: Network, metered: FloatArray | None = None, window: float = WINDOW
+) -> Matching:
+    """Loads alone in proportion to their size, all loads together, and the source.
+
+    Parameters
+    ----------
+    network : Network
+        Its nominal injections are the sizes, where there are any.
+    metered : (2N,) ndarray, optional
+        Usual [P; Q] where they are known otherwise, NaN elsewhere. [p.u.]
+    window : float
+        As for `Matching`.
+
+    Raises
+    ------
+    ParameterError
+        If neither says how large any load is.
+    """
     sensitivity = Sensitivity(network)
     moves = sensitivity.renewed()
-    nominal = np.concatenate([network.p_nominal_pu, network.q_nominal_pu])[sensitivity.inputs]
+    n = network.n_bus
+    size = np.concatenate([network.p_nominal_pu, network.q_nominal_pu])
+    if metered is not None:
+        unknown = np.tile((size[:n] == 0) & (size[n:] == 0), 2) & np.isfinite(metered)
+        size = np.where(unknown, metered, size)
+    size = size[sensitivity.inputs]
+    if not size.any():
+        raise ParameterError(
+            'noise = "innovation" needs to know how large the loads are: give p_load_mw and '
+            "q_load_mvar in the buses table, or meter injections before the study"
+        )
 
     def halves(voltage: ComplexArray) -> tuple[FloatArray, ...]:
         by_input, by_voltage = moves(voltage)
-        alone = by_input * np.abs(nominal)
-        return alone, (by_input @ nominal)[:, None], by_voltage
+        alone = by_input * np.abs(size)
+        return alone, (by_input @ size)[:, None], by_voltage
 
     return Matching(halves, START, window)
