@@ -324,6 +324,17 @@ def test_meter_that_stays_wrong_is_not_believed_for_it() -> None:
     assert max(done.rmse(b.truth)) < 0.02
 
 
+@pytest.mark.parametrize("robustness", ["trace", "per_channel"])
+def test_absurd_readings_that_stay_are_survived(robustness: str) -> None:
+    """Two meters read ten million from one instant on."""
+    b = still("ieee14")
+    z = b.measure(np.random.default_rng(SEED))
+    z[5:, [3, 20]] = 1e7
+    done = b.run(b.filter(robustness=robustness), z)
+    assert done.times(Status.DIVERGED) == 0
+    assert np.abs(done.x - b.truth).max() < 0.1
+
+
 def test_residuals_name_the_bad_channel() -> None:
     b = still("ieee14")
     z = b.measure(np.random.default_rng(SEED))

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from pse_analysis.estimation import robust
 from pse_analysis.estimation.conditioning import Prior
+from pse_analysis.estimation.deletion import FORGOTTEN
 from pse_analysis.estimation.estimator import Snapshot
 from pse_analysis.estimation.extended import linearised
 from pse_analysis.estimation.robust import MARGIN, Protection
@@ -149,14 +150,18 @@ class Recovery:
         -----
         A channel with ∂h/∂x = hᵀ that is off by η would be so most likely by an error of the
         forecast along P h. P + Σ (P h)(P h)ᵀ η²/(hᵀP h)² expects each of them to be off by η at
-        least. Where ηᵀS⁻¹η is large and no channel stands out, all of P is as much too small.
+        least, as long as no voltage is off by more than `FORGOTTEN`. Where ηᵀS⁻¹η is large and no
+        channel stands out, all of P is as much too small.
         """
         eta, found = refused.innovation, refused.found
         out = np.flatnonzero(stuck & (eta**2 > MARGIN * found.variance))
         H = self.model.jacobian(prior.x)[rows[out]]
         along = np.asarray(H @ prior.P[: prior.n])
         own = np.asarray(H.multiply(along[:, : prior.n]).sum(axis=1)).ravel()
-        along *= (eta[out] / own)[:, None]
+        along *= np.divide(eta[out], own, out=np.zeros_like(own), where=own > 0)[:, None]
+        # No voltage is off by more than its rating, whatever a broken meter reads.
+        furthest = np.abs(along[:, : prior.n]).max(axis=1, initial=0.0)
+        along /= np.maximum(furthest / FORGOTTEN, 1.0)[:, None]
         scale = max(1.0, found.nis / len(rows))
         return replace(prior, P=scale * prior.P + along.T @ along, carried=None)
 
