@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pandas as pd
 
-from pse_analysis.vocabulary import Flag, Reason, Status, usable
+from pse_analysis.vocabulary import SEVERITY, Flag, Status, usable
 
 MOST = 5
 """Channels or kinds that are named."""
@@ -46,8 +46,8 @@ def _samples(channels: Sequence[str], validated: pd.DataFrame) -> Iterable[str]:
     good = usable(flag)
     counts = {
         reason.name.lower().replace("_", " "): int(((reasons & reason) != 0).sum())
-        for reason in Reason
-        if reason.name and reason
+        for reason, severity in SEVERITY.items()
+        if reason.name and severity != Flag.GOOD
     }
     kinds = sorted(((n, k) for k, n in counts.items() if n), reverse=True)
     flagged = int((flag != Flag.GOOD).sum())

@@ -123,9 +123,9 @@ def text(
         console.print(Text(line.center(width)))
     console.print()
     console.print(table)
-    for paragraph in _closing(scored, account):
-        console.print()
-        console.print(Text("\n".join(textwrap.wrap(paragraph, WIDTH, subsequent_indent="  "))))
+    console.print()
+    for sentence in _closing(scored, account):
+        console.print(Text("\n".join(textwrap.wrap(sentence, WIDTH, subsequent_indent="  "))))
     return "\n".join(line.rstrip() for line in stored.getvalue().strip("\n").splitlines()) + "\n"
 
 
@@ -138,7 +138,7 @@ def markdown(
     rule = ["---", *("---:" for _ in head[1:])]
     lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
-    closing = [line for paragraph in _closing(scored, account) for line in ("", paragraph)]
+    closing = [line for sentence in _closing(scored, account) for line in ("", sentence)]
     return "\n".join([f"# {_title(title, scored)}", "", f"{units}.", "", *table, *lines, *closing])
 
 
