@@ -129,6 +129,32 @@ def test_method_of_a_case_file_is_built_and_a_misspelt_filter_refused() -> None:
         build(EstimateParams, data, "estimate")
 
 
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"name": " "}, "name is empty"),
+        ({"variance": 0.0}, r"variance > 0 .* received 0.0 and None"),
+        ({"variance": float("inf")}, r"variance > 0 .* received inf"),
+        ({"source_sigma": -0.1}, r"source_sigma ≥ 0, .* received 1e-06 and -0.1"),
+        ({"source_sigma": float("inf")}, r"source_sigma ≥ 0, .* and inf"),
+        ({"filter": "ukf", "compose": {"passes": 3}}, "compose.passes has no effect on ukf"),
+        (
+            {"filter": "ekf", "compose": {"scaling": "moments"}},
+            "compose.scaling has no effect on e",
+        ),
+        (
+            {"filter": "ekf", "compose": {"form": "square_root"}},
+            "compose.form has no effect on ekf",
+        ),
+    ],
+)
+def test_numbers_and_parts_that_a_method_cannot_use_are_refused(
+    change: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ParameterError, match=expected):
+        build(Method, {"name": "m", "filter": "kalman", **change}, "estimate.methods[0]")
+
+
 # --- study ----------------------------------------------------------------------------------------
 
 START = datetime(2016, 6, 9, tzinfo=UTC)
@@ -154,6 +180,7 @@ def test_another_zone_is_the_same_instant() -> None:
         ({"end": START}, r"end must lie after start, received 2016-06-09"),
         ({"step_s": 0}, r"step_s > 0 .* received step_s = 0.0"),
         ({"step_s": 1e-7}, r"step_s"),
+        ({"history_s": 1e12}, r"history_s = 1e\+12 reaches back beyond the calendar"),
         ({"history_s": -1}, r"history_s ≥ 0, received .*history_s = -1.0"),
     ],
 )

@@ -330,6 +330,12 @@ processes.as_completed = wait
         ("[score]", "[score]\nby_our = true", "unknown key 'by_our': did you mean 'by_hour'"),
         ('filter = "wls"', 'filter = "wsl"', "filter"),
         ('name = "kf_load"', 'name = "wls"', "'wls' stands twice"),
+        ('filter = "wls"', 'filter = "wls"\nvariant = "fused"', "'fused', .* one of 'last'"),
+        (
+            'filter = "wls"',
+            'filter = "observer"\nobserver = { q = [1.0, 1.0], r = 1.0 }',
+            "about a grid: use wls, kalman, ukf or ekf",
+        ),
         ("seed = 14", "seed = 14\nsede = 1", "unknown key 'sede': did you mean 'seed'"),
     ],
 )
@@ -345,7 +351,7 @@ def test_mistake_in_the_case_file_shows_before_anything_runs(
 def test_truncated_raw_table_is_refused_with_its_name(options: Options) -> None:
     text = (CASES / "small.toml").read_text(encoding="utf-8")
     assert options.cases is not None
-    head, rest = text.split("[simulate]")
+    head, rest = text.replace('grid = "ieee14"\n', "").split("[simulate]")
     (options.cases / "small.toml").write_text(head + "[validate]" + rest.split("[validate]")[1])
     raw = options.data_folder / "raw" / "small"
     (raw / "simulated.json").unlink()

@@ -56,6 +56,13 @@ class Study:
                 "[study] needs finite step_s > 0 (a microsecond at least) and history_s ≥ 0, "
                 f"received step_s = {self.step_s}, history_s = {self.history_s}"
             )
+        try:
+            _ = self.history_start
+        except OverflowError as error:
+            raise ParameterError(
+                f"[study] history_s = {self.history_s:g} reaches back beyond the calendar: "
+                "expected seconds before start, e.g. 86400 for a day"
+            ) from error
 
     @property
     def history_start(self) -> datetime:

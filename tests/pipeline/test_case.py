@@ -71,6 +71,7 @@ def test_unknown_section_names_a_close_match(cases: Path) -> None:
         ('title = "A small study"', "", "'title' is missing"),
         ('title = "A small study"', "title = 3", "title must be a text, received 3"),
         ('grid = "ieee14"', "", "needs grid"),
+        ("[simulate]\nseed = 3", "[validate]", "'ieee14' is simulated, but there is no table"),
         ("T00:00:00Z", "T00:00:00", "append 'Z'"),
         ("step_s = 300", "stepp_s = 300", "did you mean 'step_s'"),
         ("step_s = 300", "step_s = '5 min'", "expected float, received '5 min'"),

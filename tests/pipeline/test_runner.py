@@ -151,6 +151,7 @@ def test_raw_data_changed_by_hand_is_refused_and_force_simulates_again(options: 
 
 def test_raw_data_of_the_user_is_used_and_its_changes_are_seen(options: Options) -> None:
     edit(options, "[simulate]\nseed = 3\n", "")
+    edit(options, 'grid = "ieee14"\n', "")
     raw = options.data_folder / "raw" / "small"
     with pytest.raises(TableError, match=r"no raw data .* expected .*raw/small"):
         runner.run("small", options, work=WORK)
@@ -246,6 +247,8 @@ class TestCommandLine:
         [
             (TableError("aligned: no"), "error: aligned: no"),
             (FileNotFoundError(2, "No such file", "/x"), "error: /x: No such file"),
+            (OSError(28, "No space left on device"), "left on device: free some space and run"),
+            (MemoryError(), "out of memory"),
             (ZeroDivisionError("division"), "This is a bug of pse_analysis"),
         ],
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -99,6 +100,23 @@ class Method:
                 f'[estimate.methods] {self.name!r}: reading = "instant" and screening or noise = '
                 f'"innovation" are for filter = "kalman", not for {self.filter!r}: drop them'
             )
+        if not self.name.strip():
+            raise ParameterError("[estimate.methods] name is empty: give each method its own")
+        sigma = 0.0 if self.source_sigma is None else self.source_sigma
+        if not (0 < self.variance < math.inf and 0 <= sigma < math.inf):
+            raise ParameterError(
+                f"[estimate.methods] {self.name!r}: expected variance > 0 and source_sigma ≥ 0, "
+                f"both finite, received {self.variance} and {self.source_sigma}"
+            )
+        self._check_composition()
+        if (self.filter == "observer") != (self.observer is not None):
+            raise ParameterError(
+                f'[estimate.methods] {self.name!r}: filter = "observer" and a table observer = '
+                "{ q = […], r = … } or { poles = […] } belong together"
+            )
+
+    def _check_composition(self) -> None:
+        """Refuse parts that the filter would not use."""
         plain = Composition()
         if self.filter == "kalman":
             plain = replace(plain, process=self.compose.process, holt=self.compose.holt)
@@ -107,11 +125,13 @@ class Method:
                 f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, and its "
                 f"process and holt for kalman, not for {self.filter}: drop the rest"
             )
-        if (self.filter == "observer") != (self.observer is not None):
-            raise ParameterError(
-                f'[estimate.methods] {self.name!r}: filter = "observer" and a table observer = '
-                "{ q = […], r = … } or { poles = […] } belong together"
-            )
+        others = {"ukf": ("passes",), "ekf": ("scaling", "form", "points")}.get(self.filter, ())
+        for part in others:
+            if getattr(self.compose, part) != getattr(plain, part):
+                raise ParameterError(
+                    f"[estimate.methods] {self.name!r}: compose.{part} has no effect on "
+                    f"{self.filter}: drop it, or take {'ekf' if part == 'passes' else 'ukf'}"
+                )
 
 
 @dataclass(frozen=True)

@@ -283,5 +283,6 @@ def foreign(folder: Path) -> str:
     """Why a simulation leaves a raw folder alone, and what to do."""
     return (
         f"{folder} was not made by a simulation (it has no {MARKER}), so it is not overwritten: "
-        "move it away to simulate the case, or remove [simulate] from the case file to use it"
+        "move it away to simulate the case, or remove grid and [simulate] from the case file to "
+        "use it"
     )

@@ -163,6 +163,11 @@ def _check(name: str, path: Path, data: dict[str, Any]) -> Case:
             f"{path}: a case is about a grid or about a machine or about metered loads, received "
             f"{' and '.join(models)}: keep one of them"
         )
+    if "grid" in data and "simulate" not in data:
+        raise ParameterError(
+            f"{path}: grid = {data['grid']!r} is simulated, but there is no table [simulate]: drop "
+            "it to use the grid in the raw folder, or add [simulate]"
+        )
     if "simulate" in data and not models:
         raise ParameterError(
             f'{path}: a case with [simulate] needs grid = "NAME", a name of the grid library, a '

@@ -6,6 +6,7 @@ Standard library only at import; `rich` is imported when a stage has to run and 
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import shutil
 import sys
@@ -195,8 +196,12 @@ def _explain(error: Exception, debug: bool) -> int:
         traceback.print_exception(error)
     elif isinstance(error, PseError):
         print(f"error: {error}", file=sys.stderr)
-    elif isinstance(error, OSError) and error.filename is not None:
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+    elif isinstance(error, OSError):
+        place = "" if error.filename is None else f"{error.filename}: "
+        full = ": free some space and run again" if error.errno == errno.ENOSPC else ""
+        print(f"error: {place}{error.strerror or error}{full}", file=sys.stderr)
+    elif isinstance(error, MemoryError):
+        print(f"error: out of memory: {error}: shorten the study or history", file=sys.stderr)
     else:
         print(
             f"error: {type(error).__name__}: {error}\nThis is a bug of pse_analysis, not of your "

@@ -173,7 +173,7 @@ class _Run:
                 raise CacheError(
                     f"{folder / changed} is not as the simulation wrote it: --force simulates "
                     f"again and loses the change; to keep it, remove {folder / 'simulated.json'} "
-                    "and the case file's [simulate]"
+                    "and the case file's grid and [simulate]"
                 )
             if marker.get("fingerprint") == key and not forced:
                 self._report_cached(stage.name)

@@ -92,9 +92,30 @@ def check_case(case: Case) -> Parameters:
                 raise ParameterError(
                     f"[estimate.methods] the name {name!r} stands twice: give each method its own"
                 )
+        made = parameters.align.variants
+        variants = [variant.name for variant in made] or [parameters.align.variant]
+        for method in parameters.estimate.methods:
+            if method.variant not in variants:
+                raise ParameterError(
+                    f"[estimate.methods] {method.name!r} reads variant {method.variant!r}, which "
+                    f"[align] does not make: expected one of {', '.join(map(repr, variants))}"
+                )
+        if about_machine or case.simulated:
+            _check_filters(parameters.estimate, about_machine)
     except ParameterError as error:
         raise ParameterError(f"{case.path}: {error}") from error
     return parameters
+
+
+def _check_filters(estimate: EstimateParams, about_machine: bool) -> None:
+    """Refuse a machine's method for a grid, and the reverse."""
+    for method in estimate.methods:
+        if (method.filter == "observer") != about_machine:
+            right = "observer" if about_machine else "wls, kalman, ukf or ekf"
+            raise ParameterError(
+                f"[estimate.methods] {method.name!r}: filter = {method.filter!r}, but the case is "
+                f"about a {'machine' if about_machine else 'grid'}: use {right}"
+            )
 
 
 def _simulate(job: Job) -> None:
@@ -127,6 +148,7 @@ def _validate(job: Job) -> None:
     params = check_case(job.case)
     job.progress(0, 4, "reading")
     raw = read_raw(job.raw)
+    _check_filters(params.estimate, isinstance(raw.model, Machine))
     job.progress(1, 4, "checking samples")
     validated = validate(
         raw.telemetry,
