@@ -13,6 +13,7 @@ from pse_analysis.alignment import AlignParams
 from pse_analysis.errors import ParameterError, PseError
 from pse_analysis.estimation import EstimateParams, Method
 from pse_analysis.parameters import Study, build
+from pse_analysis.validation import Rule
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def test_keys_that_are_not_given_take_their_defaults() -> None:
         ({"count": 1, "span": [1.0]}, r"\[t.span\] expected a list of 2, received \[1.0\]"),
         ({"count": 1, "span": [1.0, "x"]}, r"\[t.span\[1\]\] expected float, received 'x'"),
         ({"count": 1, "by_name": {"pmu": "x"}}, r"\[t.by_name.pmu\] expected float"),
-        ({"count": 1, "either": 1.5}, r"\[t.either\] expected int \| str \| None, received 1.5"),
+        ({"count": 1, "either": 1.5}, r"\[t.either\] expected int or str, received 1.5"),
         ({"count": 1, "by_name": [1]}, r"\[t.by_name\] expected a table, received \[1\]"),
     ],
 )
@@ -127,6 +128,11 @@ def test_method_of_a_case_file_is_built_and_a_misspelt_filter_refused() -> None:
     data["methods"][0]["filter"] = "kallman"
     with pytest.raises(ParameterError, match=r"methods\[0\].filter\].*'kalman'.*'kallman'"):
         build(EstimateParams, data, "estimate")
+
+
+def test_choices_are_spelt_out() -> None:
+    with pytest.raises(ParameterError, match=r"expected 'optimal' or 'scan' or float, received 'b"):
+        build(Rule, {"k": "best"}, "validate.rules[0]")
 
 
 @pytest.mark.parametrize(

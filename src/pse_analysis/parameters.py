@@ -172,4 +172,14 @@ def _wrong(where: str, hint: Any, value: Any, expected: str = "") -> ParameterEr
             expected = "a list"
         else:
             expected = kind.__name__
-    return ParameterError(f"[{where}] expected {expected or hint}, received {value!r}")
+    return ParameterError(f"[{where}] expected {expected or _named(hint)}, received {value!r}")
+
+
+def _named(hint: Any) -> str:
+    """A type as a user would name it."""
+    options = typing.get_args(hint)
+    if typing.get_origin(hint) is typing.Literal:
+        return " or ".join(map(repr, options))
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return " or ".join(_named(option) for option in options if option is not type(None))
+    return hint.__name__ if isinstance(hint, type) else str(hint)

@@ -223,6 +223,9 @@ def test_branch_to_nowhere_names_the_bus() -> None:
     tables["buses"].loc[3, "name"] = "3"
     with pytest.raises(GridError, match="name '3' repeats"):
         Network.from_tables(**tables)
+    tables["buses"].loc[3, "name"] = np.nan
+    with pytest.raises(GridError, match="name is empty in row 3"):
+        Network.from_tables(**tables)
 
 
 def test_missing_column_names_it_and_what_came() -> None:

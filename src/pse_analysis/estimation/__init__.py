@@ -122,8 +122,8 @@ class Method:
             plain = replace(plain, process=self.compose.process, holt=self.compose.holt)
         if self.filter not in ("ukf", "ekf") and self.compose != plain:
             raise ParameterError(
-                f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, and its "
-                f"process and holt for kalman, not for {self.filter}: drop the rest"
+                f"[estimate.methods] {self.name!r}: compose = {{ … }} is for ukf and ekf, and of "
+                f"it process and holt alone for kalman; the filter is {self.filter}: drop the rest"
             )
         others = {"ukf": ("passes",), "ekf": ("scaling", "form", "points")}.get(self.filter, ())
         for part in others:

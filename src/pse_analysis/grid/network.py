@@ -359,6 +359,11 @@ class Network:
                 )
         if len(network) != 1:
             raise GridError(f"grid table 'network': expected one row, received {len(network)}")
+        if buses["name"].isna().any():
+            raise GridError(
+                f"grid table 'buses': name is empty in row {int(np.argmax(buses['name'].isna()))}: "
+                "name that bus, or leave it out"
+            )
         names = tuple(buses["name"].astype(str))
         if len(set(names)) != len(names):
             repeated = next(n for n in names if names.count(n) > 1)
