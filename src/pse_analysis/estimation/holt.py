@@ -149,10 +149,13 @@ def local_trend(params: HoltParams | None = None) -> Process:
         n = len(s) // 2
         ahead = s.copy()
         ahead[:n] += s[n:]
-        # F P Fᵀ with F = [[I, I], [0, I]]: rows, then columns, of the slope are added.
+        # F P Fᵀ with F = [[I, I], [0, I]], added so that it is exactly symmetric if P is.
         moved = covariance.copy()
-        moved[:n] += moved[n:]
-        moved[:, :n] += moved[:, n:]
+        cross, slope = covariance[:n, n:], covariance[n:, n:]
+        moved[:n, :n] += slope
+        moved[:n, :n] += cross + cross.T
+        moved[:n, n:] += slope
+        moved[n:, :n] = moved[:n, n:].T
         return ahead, moved, None
 
     return Process(

@@ -159,6 +159,7 @@ class Lagged:
         Backwards the walk spreads again: Cov(x₋ⱼ, x₋ₖ) = P + min(j, k) Q.
         """
         n, past = self.n, self.past
+        P = 0.5 * (P + P.T)
         s, started, memory = self.process.begin(x, P, noise)
         older = np.minimum.outer(np.arange(past), np.arange(past))
         covariance = np.zeros((self.blocks * n, self.blocks * n))
