@@ -220,7 +220,8 @@ def _utc(times: pd.Series, name: str, timezone: str | None) -> pd.Series:
         except Exception as error:
             raise TableError(
                 f"telemetry: column {name!r} cannot be read as times in {timezone!r} ({error}); "
-                "around a change of summer time only the source's UTC offset tells: export UTC"
+                "around a change of summer time only the source's UTC offset tells: export UTC, "
+                f"or offsets, and read them with pandas.to_datetime(frame.{name}, utc=True)"
             ) from error
     return times.dt.tz_convert("UTC").dt.as_unit("us")
 
