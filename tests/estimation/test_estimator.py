@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 from reference import channels_table
 
-from pse_analysis.errors import TableError
-from pse_analysis.estimation import Method, estimate
+from pse_analysis.errors import NotConverged, TableError
+from pse_analysis.estimation import Method, estimate, load_learning
 from pse_analysis.estimation.driver import run
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
@@ -302,3 +302,17 @@ def test_dead_reckoning_holds_for_the_power_rows_too() -> None:
         state, info = made.step(state, dataclasses.replace(begin, time=time, available=powers))
         assert info.used.sum() == powers.sum()
     np.testing.assert_allclose(made.read(state).x, TRUTH, atol=1e-6)
+
+
+def test_a_method_that_history_teaches_nothing_says_so_and_does_not_stop_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def lost(*_args: object, **_options: object) -> None:
+        raise NotConverged("no power flow at the usual loads")
+
+    monkeypatch.setattr(load_learning, "learn_load", lost)
+    got = estimate(telemetry(3), CHANNELS, NETWORK, study(3), Method("kf", "kalman", "load"))
+    assert set(got.steps["status"]) == {"not_converged"}
+    assert got.steps["detail"].str.contains("no power flow at the usual loads").all()
+    assert got.estimated["value"].isna().all()
+    assert got.residuals.empty

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.errors import NotConverged, ParameterError, TableError, Unobservable
 from pse_analysis.estimation import (
     composition,
     load_learning,
@@ -22,7 +22,7 @@ from pse_analysis.estimation import (
 )
 from pse_analysis.estimation.composition import Composition
 from pse_analysis.estimation.driver import Estimated, States, run
-from pse_analysis.estimation.estimator import Estimator
+from pse_analysis.estimation.estimator import Estimator, Info
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.noise import of_grid
 from pse_analysis.estimation.records import Record, record
@@ -32,7 +32,7 @@ from pse_analysis.machine import Machine
 from pse_analysis.measurement import BUS, Model, P, Q, SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.validation.adaptive import AdaptiveParams
-from pse_analysis.vocabulary import check
+from pse_analysis.vocabulary import Status, check
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -300,7 +300,10 @@ def estimate(
         estimator = _build_observer(method, model, study)
         snapshots, layout = machine.snapshots(studied, layout, model)
     else:
-        estimator = build(method, model, layout, study, whole.between(None, start))
+        try:
+            estimator = build(method, model, layout, study, whole.between(None, start))
+        except (NotConverged, Unobservable) as error:
+            estimator = _without_estimates(method.name, layout, str(error))
         snapshots = studied.snapshots()
     reference = None if truth is None else true_states(truth, model, studied.time, trial)
     result = run(estimator, snapshots, model, layout, trial=trial, truth=reference)
@@ -308,6 +311,14 @@ def estimate(
         check("estimated", result.estimated),
         check("residuals", result.residuals),
         check("steps", result.steps),
+    )
+
+
+def _without_estimates(name: str, layout: SensorLayout, why: str) -> Estimator:
+    """A method that the history gives nothing to start from: it says so, and the others go on."""
+    info = Info.nothing(len(layout), Status.NOT_CONVERGED, f"nothing learnt from history: {why}")
+    return Estimator(
+        name, lambda _snapshot: (None, info), lambda _state, _snapshot: (None, info), lambda _: None
     )
 
 
