@@ -137,3 +137,23 @@ def test_search_leaves_half_at_most() -> None:
     eta = np.array([90.0, 80.0, 70.0, 60.0, 50.0, 0.0])
     named = deletion(S, eta).search(np.ones(6, dtype=bool), PRICE)
     assert tuple(np.flatnonzero(named)) == (0, 1, 2)
+
+
+def test_a_search_that_rounding_sends_to_and_fro_comes_to_an_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two channels that see next to the same, each seems the better one to blame."""
+    M = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) + 1e-9 * np.eye(3)
+    eta = np.array([20.0, 0.0, 0.1])
+    deletion = Deletion(M @ eta, np.diagonal(M), lambda asked: M[:, asked], float(eta @ M @ eta))
+    swaps = []
+
+    def swapped(_self: Deletion, out: np.ndarray, *_rest: object) -> np.ndarray:
+        swaps.append(out)
+        return np.array([1 - out[0]])
+
+    monkeypatch.setattr(Deletion, "_exchanged", swapped)
+    found = deletion.search(np.zeros(3, dtype=bool), 9.0)
+    assert found.sum() == 1
+    assert not found[2]
+    assert len(swaps) <= 3

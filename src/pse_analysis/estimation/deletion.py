@@ -131,7 +131,13 @@ class Deletion:
         if len(out) > limit:
             out = out[:0]
         out = self._settled(out, price)
+        seen: set[bytes] = set()
         while len(out) < len(start):
+            # Where measurements see next to the same, rounding may lead back to where it was.
+            here = np.sort(out).tobytes()
+            if here in seen:
+                break
+            seen.add(here)
             more, rest = self._extended(out, price, limit)
             out = self._settled(more, price)
             if len(out) == len(more):
