@@ -234,21 +234,27 @@ class _Rest:
     def __init__(
         self, weighted: FloatArray, diagonal: FloatArray, out: IntArray, across: FloatArray
     ) -> None:
-        self.weighted, self.diagonal, self._half = weighted, diagonal, across
+        self.weighted, self.diagonal = weighted, diagonal
+        self._count = len(out)
+        self._room = np.empty((len(diagonal), 2 * len(out) + 8), order="F")
         if len(out):
             factor = _factor(across[out])
             half = blas.dtrsm(1.0, factor, across, side=1, lower=1, trans_a=1)
             self.weighted = weighted - half @ blas.dtrsv(factor, weighted[out], lower=1)
             self.diagonal = diagonal - np.einsum("ij,ij->i", half, half)
-            self._half = half
+            self._room[:, : len(out)] = half
 
     def leave_out(self, row: int, column: FloatArray) -> None:
         """Leave one more out, given its column of M."""
-        new = column - self._half @ self._half[row]
+        half = self._room[:, : self._count]
+        new = column - half @ half[row]
         new /= np.sqrt(new[row])
         self.weighted = self.weighted - (self.weighted[row] / new[row]) * new
         self.diagonal = self.diagonal - new**2
-        self._half = np.column_stack([self._half, new])
+        if self._count == self._room.shape[1]:
+            self._room = np.hstack([self._room, np.empty_like(self._room)])
+        self._room[:, self._count] = new
+        self._count += 1
 
     def ratio(self, out: IntArray, floor: FloatArray) -> FloatArray:
         """`Standing.ratio` of the kept ones, zero for the left-out and critical ones."""
@@ -272,8 +278,11 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     """Inverse of a small precision."""
     if not len(matrix):
         return matrix
+    # Above its diagonal the factor is zero, and LAPACK leaves that as it is.
     lower, _ = lapack.dpotri(_factor(matrix), lower=1, overwrite_c=1)
-    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+    whole = lower + lower.T
+    whole.flat[:: len(whole) + 1] *= 0.5
+    return np.asarray(whole)
 
 
 def of_snapshot(
