@@ -18,7 +18,7 @@ from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltage
 from pse_analysis.estimation.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import scalar_noise
 from pse_analysis.estimation.records import Record, record
-from pse_analysis.estimation.wls import tracking_wls
+from pse_analysis.estimation.tracking import tracking_wls
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VM, MeasurementModel, P, Q, SensorLayout

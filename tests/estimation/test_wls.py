@@ -12,7 +12,8 @@ from reference import GRIDS, every_quantity, measured
 
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.wls import WeightedLeastSquares, tracking_wls
+from pse_analysis.estimation.tracking import tracking_wls
+from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve

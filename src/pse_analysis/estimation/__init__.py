@@ -26,7 +26,8 @@ from pse_analysis.estimation.estimator import Estimator, Info
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.noise import of_grid
 from pse_analysis.estimation.records import Record, record
-from pse_analysis.estimation.wls import state_columns, tracking_wls
+from pse_analysis.estimation.tracking import tracking_wls
+from pse_analysis.estimation.wls import state_columns
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.measurement import BUS, Model, P, Q, SensorLayout
