@@ -45,8 +45,8 @@ def test_samples_are_counted_by_reason_and_silent_channels_are_named() -> None:
     told = account.of_run(CHANNELS, validated(), steps(["ok"] * 10), residuals(a=1.0))
     assert told == [
         "telemetry: 30 samples of 4 channels, 11 flagged, reasons: limit 10, late 1",
-        "channels without a threshold for their changes (no history to learn it from, or no rule "
-        "asks for one), so that limits and stamps alone were checked: b, dead",
+        "only limits and stamps were checked (no history to learn it from, or no rule asks for "
+        "one) of b, dead",
         "channels without a usable sample: dead",
         "channels of which most samples are flagged: c (90%)",
     ]
@@ -60,4 +60,4 @@ def test_steps_that_did_not_work_are_told_with_their_first_reason() -> None:
 
 def test_a_channel_that_no_method_agrees_with_is_named_and_one_that_a_method_lost_is_not() -> None:
     told = account.of_run(CHANNELS, validated(), steps(["ok"]), residuals(a=1.0, b=8.0))
-    assert told[-1].startswith("channels that no method can agree with: b (8 σ): look at")
+    assert told[-1].startswith("channels that no method can agree with: b (12 σ): look at")

@@ -57,9 +57,10 @@ def tracking_wls(name: str, network: Network, layout: SensorLayout) -> Estimator
         except Unobservable as error:
             return None, Info.nothing(m, Status.UNOBSERVABLE, str(error))
         if not solution.converged:
-            return None, Info.nothing(
-                m, Status.NOT_CONVERGED, f"no convergence in {solution.iterations} iterations"
-            )
+            reached = f"in {solution.iterations} iterations"
+            if solution.iterations < wls.max_iterations:
+                reached = f"{reached}: the state ran away, some measurements are grossly wrong"
+            return None, Info.nothing(m, Status.NOT_CONVERGED, f"no convergence {reached}")
         covariance = solution.covariance()
         J = model.jacobian(solution.x)
         columns = np.ix_(model.columns, model.columns)

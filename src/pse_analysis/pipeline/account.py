@@ -15,7 +15,9 @@ from pse_analysis.vocabulary import SEVERITY, Flag, Status, usable
 MOST = 5
 """Channels or kinds that are named."""
 FAR = 3.0
-"""RMS of a channel's innovations over their σ from which on it stands out."""
+"""Usual innovation of a channel, in units of its σ, from which on it stands out."""
+NORMAL = 0.6745
+"""Median of |x| of a normal law over its σ; single gross errors do not move it."""
 
 
 def of_run(
@@ -57,11 +59,11 @@ def _samples(channels: Sequence[str], validated: pd.DataFrame) -> Iterable[str]:
     yield text
     judged = set(validated.loc[validated["threshold"].notna(), "channel"])
     blind = [name for name in channels if name not in judged]
-    if blind:
-        yield (
-            f"channels without a threshold for their changes (no history to learn it from, or no "
-            f"rule asks for one), so that limits and stamps alone were checked: {_named(blind)}"
-        )
+    why = "no history to learn it from, or no rule asks for one"
+    if blind == list(channels):
+        yield f"only limits and stamps were checked, no threshold for changes ({why})"
+    elif blind:
+        yield f"only limits and stamps were checked ({why}) of {_named(blind)}"
     heard = set(validated["channel"].to_numpy()[good])
     silent = [name for name in channels if name not in heard]
     if silent:
@@ -87,11 +89,11 @@ def _steps(steps: pd.DataFrame) -> Iterable[str]:
 
 def _far_channels(residuals: pd.DataFrame) -> Iterable[str]:
     ratio = (residuals["innovation"] / residuals["sigma_innovation"]).where(residuals["used"])
-    square = ratio.replace([np.inf, -np.inf], np.nan) ** 2
-    by_method = square.groupby([residuals["method"], residuals["channel"]], observed=True).mean()
+    size = ratio.replace([np.inf, -np.inf], np.nan).abs() / NORMAL
+    by_method = size.groupby([residuals["method"], residuals["channel"]], observed=True).median()
     # A method that goes astray drags all channels along; what is wrong stands out in all of them.
-    rms = np.sqrt(by_method.groupby(level="channel", observed=True).min())
-    far = rms[rms > FAR].sort_values(ascending=False)
+    least = by_method.groupby(level="channel", observed=True).min()
+    far = least[least > FAR].sort_values(ascending=False)
     if len(far):
         named = [f"{name} ({size:.0f} σ)" for name, size in far.items()]
         yield (
