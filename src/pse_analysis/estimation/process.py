@@ -25,7 +25,8 @@ ComplexArray = npt.NDArray[np.complex128]
 KEPT_PU = 1e-2
 """Sensitivities are kept while no voltage moves by more. [p.u.]
 
-Q then errs by up to 3 % and its σ by half of that, far less than loads are known to vary.
+Q then errs by up to 3 % as a whole on grids of 30 to 300 buses, and the σ of single voltages by
+some 4 %, more only where a voltage hardly moves at all: less than loads are known to vary.
 """
 
 ProcessNoise = Callable[[ComplexArray, np.datetime64], FloatArray]

@@ -56,7 +56,8 @@ def robust_wls(
     """
     left_out = np.zeros(len(z), dtype=bool)
     solution = wls.solve(z, sigma, available)
-    freedom = int(available.sum()) - wls.model.shape[1]
+    # A reference that stands for silent angles counts as one measurement.
+    freedom = int(available.sum()) + int(solution.pinned) - wls.model.shape[1]
     if freedom <= 0:
         return solution, left_out
     if solution.converged and solution.objective <= gate(freedom)[0]:

@@ -27,7 +27,7 @@ HEAVIEST = 1.0
 MEMORY = 288
 """Residuals that quantiles are taken of: a day of five-minute steps has calm hours and others."""
 RENEWAL = 8
-"""Steps after which quantiles are taken for the first time, and again at least."""
+"""Steps, and new residuals of a channel, that it takes at least before quantiles are taken."""
 SHARE = 12
 """They are taken again when the steps since are one in so many of all, or of `MEMORY` if that is
 less: so few residuals hardly move them.
