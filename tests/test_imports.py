@@ -25,6 +25,7 @@ MODULES = {
 # A part may import itself and what stands in an earlier line.
 LAYERS = (
     ("errors",),
+    ("files",),
     ("parameters", "vocabulary"),
     ("grid", "machine", "measurement", "telemetry"),
     ("simulation", "validation"),

@@ -15,6 +15,10 @@ class TableError(PseError, ValueError):
     """A table does not have the columns, types, units or names that its schema asks for."""
 
 
+class DamagedFile(TableError):
+    """A file is not as it was written: cut short, damaged, or changed by somebody else."""
+
+
 class GridError(PseError, ValueError):
     """A grid model is inconsistent, or an element is not in it."""
 

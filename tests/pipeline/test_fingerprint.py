@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from pse_analysis import files
 from pse_analysis.pipeline import fingerprint as fp
 
 BASE: dict[str, Any] = {
@@ -45,9 +46,9 @@ def test_stage_is_part_of_it() -> None:
 def test_file_digest_follows_content_not_name(tmp_path: Path) -> None:
     for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
         (tmp_path / name).write_bytes(content)
-    files = fp.describe_folder(tmp_path)
-    assert files["a"] == files["b"]
-    assert files["a"]["digest"] != files["c"]["digest"]
+    digest = {name: facts["digest"] for name, facts in files.describe_folder(tmp_path).items()}
+    assert digest["a"] == digest["b"]
+    assert digest["a"] != digest["c"]
 
 
 @pytest.fixture

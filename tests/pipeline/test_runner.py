@@ -10,6 +10,7 @@ import pytest
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.pipeline import cli, runner
 from pse_analysis.pipeline.cache import CacheError
+from pse_analysis.pipeline.descent import read_parameters
 from pse_analysis.pipeline.plan import NAMES, STAGES, Job, Options, Reporter, Stage
 
 CASE = """
@@ -33,7 +34,7 @@ def fake(stage: Stage) -> Callable[[Job], None]:
     """Work that writes down what it read: the same inputs give the same bytes."""
 
     def work(job: Job) -> None:
-        seen = [repr(runner.parameters(job.case, stage))]
+        seen = [repr(read_parameters(job.case, stage))]
         seen += [(job.raw / n).read_text() for n in stage.raw if (job.raw / n).is_file()]
         seen += [(job.inputs[s] / f"{t}.parquet").read_text() for s, t in stage.tables]
         names = {t for s in STAGES for earlier, t in s.tables if earlier == stage.name}

@@ -26,8 +26,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(written: Path, tmp_path: Path) -> Path:
-    """A copy that a test may damage."""
-    return Path(shutil.copytree(written, tmp_path / "case"))
+    """A copy that a test may damage, as another program would have written it."""
+    copy = Path(shutil.copytree(written, tmp_path / "case"))
+    (copy / "checksums.json").unlink()
+    return copy
 
 
 def one_file(folder: Path) -> Path:

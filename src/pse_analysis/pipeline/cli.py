@@ -1,4 +1,4 @@
-"""The command line: ``pse run``, ``pse cases`` and ``pse view``.
+"""The command line: ``pse run``, ``pse cases``, ``pse view`` and ``pse verify``.
 
 Standard library only at import; `rich` is imported when a stage has to run and a person watches.
 """
@@ -9,22 +9,37 @@ import argparse
 import errno
 import os
 import shutil
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pse_analysis.errors import ParameterError, PseError, TableError
+from pse_analysis.files import check
 from pse_analysis.pipeline import runner
-from pse_analysis.pipeline.cache import Store
 from pse_analysis.pipeline.case import Case, list_cases, load_case, project_root
-from pse_analysis.pipeline.plan import NAMES, THREADS, Options, Reporter, Result
+from pse_analysis.pipeline.plan import NAMES, THREADS, Options, Reporter, Result, again
+from pse_analysis.pipeline.results import stored
+from pse_analysis.pipeline.verify import verify
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 INTERRUPTED = 130
+ENDINGS = {signal.SIGTERM: 143, signal.SIGHUP: 129}
+"""Signals that ask the program to end, and its exit code then."""
+
+
+class Ended(BaseException):
+    """A signal asked the program to end; not an error that a stage could outlive."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = signal.Signals(number)
 
 
 class Lines(Reporter):
@@ -42,12 +57,19 @@ class Lines(Reporter):
         """Print how long it took."""
         print(f"  {stage:<9} {seconds:.1f} s", flush=True)
 
+    def warning(self, text: str) -> None:
+        """Print it among the errors."""
+        sys.stdout.flush()
+        print(f"warning: {text}", file=sys.stderr, flush=True)
+
     def result(self, result: Result) -> None:
         """Print the scores, and where everything is."""
         if result.summary:
             print(f"\n{result.summary.rstrip()}\n")
         for label, place in places(result):
             print(f"  {label:<10} {place}")
+        for stage, why in result.older.items():
+            print(f"  {stage:<10} older: {why}; `pse run {result.case.name}` makes it anew")
         print(flush=True)
 
 
@@ -123,7 +145,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
-    return _guarded(parser().parse_args(arguments))
+    with ending_by_signal():
+        return _guarded(parser().parse_args(arguments))
+
+
+@contextmanager
+def ending_by_signal() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP raise `Ended`, so that temporary folders are removed on the way out.
+
+    One that is ignored, as ``nohup`` does with SIGHUP, stays ignored.
+    """
+    before = {}
+
+    def end(number: int, _: object) -> None:
+        raise Ended(number)
+
+    # Only the main thread may say what a signal does.
+    if threading.current_thread() is threading.main_thread():
+        for number in ENDINGS:
+            if signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -140,8 +186,20 @@ def parser() -> argparse.ArgumentParser:
     cases_parser.set_defaults(command=_cases)
     view_parser = commands.add_parser("view", help="open a case's recordings in the Rerun viewer")
     view_parser.add_argument("case", metavar="CASE")
+    view_parser.add_argument(
+        "--older", action="store_true", help="also open what is older than the case file"
+    )
     _add_folders(view_parser)
     view_parser.set_defaults(command=_view)
+    verify_parser = commands.add_parser(
+        "verify", help="compare a case's files with what was written, and say what was touched"
+    )
+    verify_parser.add_argument("case", metavar="CASE")
+    verify_parser.add_argument(
+        "--accept", action="store_true", help="take the raw folder as it is from now on"
+    )
+    _add_folders(verify_parser)
+    verify_parser.set_defaults(command=_verify)
     return whole
 
 
@@ -182,6 +240,12 @@ def _guarded(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("\ninterrupted: finished stages are kept, the next run goes on", file=sys.stderr)
         return INTERRUPTED
+    except Ended as ended:
+        print(
+            f"\nended by {ended.number.name}: finished stages are kept, the next run goes on",
+            file=sys.stderr,
+        )
+        return ENDINGS[ended.number]
     except BrokenPipeError:
         # Whoever read the output, for example `head`, has seen enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -258,15 +322,21 @@ def _cases(options: argparse.Namespace) -> int:
 def _view(options: argparse.Namespace) -> int:
     case = load_case(options.case, options.cases)
     wanted = Options(data=options.data, cases=options.cases)
-    store = Store(wanted.data_folder / "processed" / case.name)
-    raw = wanted.data_folder / "raw" / case.name
-    recordings = Result(case, raw, store.entries()).recordings
-    missing = [path for path in recordings if not path.is_file()]
-    if not recordings or missing:
+    folder = wanted.data_folder / "processed" / case.name
+    entries, older = stored(case, wanted)
+    shown = {s: e for s, e in entries.items() if options.older or s not in older}
+    result = Result(case, wanted.data_folder / "raw" / case.name, shown)
+    for stage in (stage for stage in entries if stage in older):
+        told = "is older" if options.older else "is left out, because it is older"
+        print(f"{stage} {told}: {older[stage]}", file=sys.stderr)
+    if not result.recordings:
         raise TableError(
-            f"case {case.name!r} has no recordings in {store.folder}: run it first, with "
+            f"case {case.name!r} has no current recordings in {folder}: run it first, with "
             f"`pse run {case.name}`"
         )
+    for path in result.recordings:
+        facts = next(e.files[path.name] for e in shown.values() if e.folder == path.parent)
+        check(path, facts, again(case.name))
     beside = Path(sys.executable).with_name("rerun")
     viewer = str(beside) if beside.is_file() else shutil.which("rerun")
     if viewer is None:
@@ -274,5 +344,20 @@ def _view(options: argparse.Namespace) -> int:
             f"no Rerun viewer: expected {beside} or rerun on the PATH; install rerun-sdk"
         )
     # The viewer would listen on every interface unless told otherwise.
-    command = [viewer, *map(str, recordings), "--bind", "127.0.0.1"]
+    command = [viewer, *map(str, result.recordings), "--bind", "127.0.0.1"]
     os.execv(viewer, command)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    case = load_case(options.case, options.cases)
+    wanted = Options(data=options.data, cases=options.cases)
+    if options.accept:
+        from pse_analysis.telemetry import accept
+
+        accept(wanted.data_folder / "raw" / case.name)
+    count, findings = verify(case, wanted)
+    for finding in findings:
+        print(f"{'damaged' if finding.damage else 'note':<8} {_near(finding.path)} {finding.what}")
+    damaged = sum(finding.damage for finding in findings)
+    print(f"{count} files compared, {damaged} damaged or changed since they were written")
+    return 1 if damaged else 0

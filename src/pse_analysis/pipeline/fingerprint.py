@@ -15,9 +15,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pse_analysis.files import digest_file
+
 PACKAGE = "pse_analysis"
 SOURCE_ROOT = Path(__file__).resolve().parents[2]
-DIGEST_BYTES = 16
 FINGERPRINT_BYTES = 10
 
 # Only absolute imports are allowed in this package, and each stands on lines of its own, so that
@@ -28,26 +29,6 @@ _IMPORT = re.compile(
     re.MULTILINE,
 )
 _COMMENT = re.compile(r"#[^\n]*")
-
-
-def digest_file(path: Path) -> str:
-    """Digest of a file's content."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(
-            file, lambda: hashlib.blake2b(digest_size=DIGEST_BYTES)
-        ).hexdigest()
-
-
-def describe_folder(folder: Path) -> dict[str, dict[str, Any]]:
-    """Size and digest of every file below a folder, by its path relative to it, sorted."""
-    paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
-    return {
-        path.relative_to(folder).as_posix(): {
-            "bytes": path.stat().st_size,
-            "digest": digest_file(path),
-        }
-        for path in paths
-    }
 
 
 def module_file(module: str) -> Path | None:

@@ -8,10 +8,12 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.files import check
 from pse_analysis.pipeline.cache import Entry
 from pse_analysis.pipeline.case import Case, project_root
 
@@ -114,6 +116,9 @@ class Reporter:
     def progress(self, stage: str, done: int, total: int, note: str) -> None:
         """Report how far the running stage is."""
 
+    def warning(self, text: str) -> None:
+        """Report something that a person should know, although the run goes on."""
+
     def finished(self, stage: str, seconds: float) -> None:
         """Report that a stage's result is stored."""
 
@@ -200,6 +205,9 @@ class Job:
         Processes it may use.
     progress : callable
         ``progress(done, total, note)``.
+    provenance : mapping
+        What every table that it writes says of its origin,
+        `pse_analysis.telemetry.read_provenance`.
     """
 
     case: Case
@@ -209,6 +217,7 @@ class Job:
     output: Path
     workers: int
     progress: Callable[[int, int, str], None]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
 
 Work = Mapping[str, Callable[[Job], None]]
@@ -228,6 +237,8 @@ class Result:
         Current result of each stage that has one.
     ran, cached : tuple of str
         Stages that ran, and stages whose results were current.
+    older : mapping of str to str
+        Stages whose stored result does not descend from the current ones, and why.
     """
 
     case: Case
@@ -235,6 +246,7 @@ class Result:
     entries: Mapping[str, Entry]
     ran: tuple[str, ...] = ()
     cached: tuple[str, ...] = ()
+    older: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def recordings(self) -> tuple[Path, ...]:
@@ -249,8 +261,20 @@ class Result:
 
     @property
     def summary(self) -> str:
-        """The table of scores as text; empty if the case is not scored."""
+        """The table of scores as text; empty if the case is not scored.
+
+        Raises
+        ------
+        DamagedFile
+            If it is not as it was written.
+        """
         entry = self.entries.get("score")
         if entry is None or SUMMARY not in entry.files:
             return ""
+        check(entry.folder / SUMMARY, entry.files[SUMMARY], again(self.case.name))
         return (entry.folder / SUMMARY).read_text(encoding="utf-8")
+
+
+def again(case: str) -> str:
+    """What to do about a derived file that is not as it was written."""
+    return f"`pse run {case} --force` makes it again"

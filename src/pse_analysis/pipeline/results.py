@@ -12,10 +12,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from pse_analysis.errors import TableError
-from pse_analysis.pipeline import runner
+from pse_analysis.files import Facts, check
+from pse_analysis.pipeline import descent, runner
 from pse_analysis.pipeline.cache import Entry, Store
 from pse_analysis.pipeline.case import Case, load_case
-from pse_analysis.pipeline.plan import NAMES, Options, Reporter, Result
+from pse_analysis.pipeline.plan import NAMES, Options, Reporter, Result, again
+from pse_analysis.pipeline.raw_folder import RawFolder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,6 +27,25 @@ if TYPE_CHECKING:
     from pse_analysis.pipeline.stages import Parameters
 
 RAW_TABLES = ("telemetry", "channels", "truth", "sample_truth", "faults")
+
+
+class Recordings(Mapping[str, Path]):
+    """Rerun recording of each stage that has one; asked for, it is compared with its digest."""
+
+    def __init__(self, case: str, files: Mapping[str, tuple[Path, Facts]]) -> None:
+        self._case = case
+        self._files = files
+
+    def __getitem__(self, stage: str) -> Path:
+        path, facts = self._files[stage]
+        check(path, facts, again(self._case))
+        return path
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
 
 
 @dataclass(frozen=True)
@@ -44,6 +65,9 @@ class Results(Mapping[str, "pd.DataFrame"]):
         Rerun recording of each stage that has one.
     summary : str
         The table of scores as text; empty before the case is scored.
+    older : mapping of str to str
+        Stages whose stored result does not descend from the case file and the other results as
+        they are now, and why. Their tables are left out, unless `load` was asked for them.
     """
 
     case: Case
@@ -51,6 +75,9 @@ class Results(Mapping[str, "pd.DataFrame"]):
     files: Mapping[str, Path]
     recordings: Mapping[str, Path]
     summary: str
+    older: Mapping[str, str] = field(default_factory=dict)
+    _facts: Mapping[str, Facts] = field(default_factory=dict, repr=False, compare=False)
+    _hidden: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, pd.DataFrame] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -76,26 +103,33 @@ class Results(Mapping[str, "pd.DataFrame"]):
 
     def __getitem__(self, table: str) -> pd.DataFrame:
         if table not in self._read:
-            from pse_analysis.pipeline.tables import read_raw_table
+            from pse_analysis.pipeline.tables import find_raw_table
             from pse_analysis.telemetry import read_table
 
+            if table in self._hidden:
+                raise TableError(
+                    f"{table} is older than what it was made from ({self._hidden[table]}): "
+                    f"`pse run {self.case.name}` brings it up to date, "
+                    f"load({self.case.name!r}, older=True) shows it as it is"
+                )
             if table not in set(self):
                 raise KeyError(f"{table}: expected any of {', '.join(self)}")
-            if table in self.files and not self.files[table].is_file():
-                raise TableError(
-                    f"{self.files[table]} is gone: a later run replaced it; load the case again"
-                )
-            frame = (
-                read_table(self.files[table], table)
-                if table in self.files
-                else read_raw_table(self.raw_folder, table)
-            )
-            assert frame is not None
+            if table in self.files:
+                if not self.files[table].is_file():
+                    raise TableError(
+                        f"{self.files[table]} is gone: a later run replaced it; load the case again"
+                    )
+                check(self.files[table], self._facts[table], again(self.case.name))
+                frame = read_table(self.files[table], table)
+            else:
+                found = find_raw_table(self.raw_folder, table)
+                assert found is not None
+                frame = found
             self._read[table] = frame
         return self._read[table]
 
     def __iter__(self) -> Iterator[str]:
-        yield from (name for name in RAW_TABLES if self._in_raw(name))
+        yield from (n for n in RAW_TABLES if n not in self._hidden and self._in_raw(n))
         yield from self.files
 
     def __len__(self) -> int:
@@ -107,28 +141,53 @@ class Results(Mapping[str, "pd.DataFrame"]):
         ).is_file()
 
 
-def _results(case: Case, raw_folder: Path, entries: Mapping[str, Entry]) -> Results:
-    files: dict[str, Path] = {}
-    recordings: dict[str, Path] = {}
+def _results(
+    case: Case,
+    raw_folder: Path,
+    entries: Mapping[str, Entry],
+    older: Mapping[str, str],
+    shown: bool = False,
+) -> Results:
+    """Results of the given entries; without those that are older, unless they are to be shown."""
+    hidden = {} if shown else {stage: why for stage, why in older.items() if stage in NAMES}
+    tables: dict[str, tuple[Path, Facts]] = {}
+    recordings: dict[str, tuple[Path, Facts]] = {}
+    left_out = dict.fromkeys(RAW_TABLES, hidden["simulate"]) if "simulate" in hidden else {}
     for stage in NAMES:
         entry = entries.get(stage)
-        for name in entry.files if entry is not None else ():
+        for name, facts in entry.files.items() if entry is not None else ():
             assert entry is not None
-            if name.endswith(".parquet"):
-                files[name.removesuffix(".parquet")] = entry.folder / name
-            elif name.endswith(".rrd"):
-                recordings[stage] = entry.folder / name
+            table, found = name.removesuffix(".parquet"), (entry.folder / name, facts)
+            if name.endswith(".parquet") and stage in hidden:
+                left_out[table] = hidden[stage]
+            elif name.endswith(".parquet"):
+                tables[table] = found
+            elif name.endswith(".rrd") and stage not in hidden:
+                recordings[stage] = found
+    current = {stage: entry for stage, entry in entries.items() if stage not in hidden}
     return Results(
         case=case,
         raw_folder=raw_folder,
-        files=MappingProxyType(files),
-        recordings=MappingProxyType(recordings),
-        summary=Result(case, raw_folder, entries).summary,
+        files=MappingProxyType({table: path for table, (path, _) in tables.items()}),
+        recordings=Recordings(case.name, recordings),
+        summary=Result(case, raw_folder, current).summary,
+        older=MappingProxyType(dict(older)),
+        _facts={table: facts for table, (_, facts) in tables.items()},
+        _hidden=left_out,
     )
 
 
-def load(case: str, data: str | Path | None = None, cases: str | Path | None = None) -> Results:
+def load(
+    case: str,
+    data: str | Path | None = None,
+    cases: str | Path | None = None,
+    *,
+    older: bool = False,
+) -> Results:
     """Current tables of a case, as its last run left them.
+
+    A table is current if it descends from the case file and from the other tables as they are
+    now; `Results.older` says which stages do not, and why.
 
     Parameters
     ----------
@@ -136,24 +195,43 @@ def load(case: str, data: str | Path | None = None, cases: str | Path | None = N
         Its name.
     data, cases
         Folder of raw and processed data, folder of case files; by default the project's own.
+    older
+        Give older tables too. They belong to other parameters than `Results.parameters`.
 
     Raises
     ------
     ParameterError
         If there is no such case.
     TableError
-        If it was not run yet.
+        If it was not run yet, or everything is older.
     """
     options = Options(data=_path(data), cases=_path(cases))
     found = load_case(case, options.cases)
-    store = Store(options.data_folder / "processed" / found.name)
-    entries = {name: entry for name, entry in store.entries().items() if entry.whole()}
+    folder = options.data_folder / "processed" / found.name
+    entries, outdated = stored(found, options)
     if not entries:
         raise TableError(
-            f"case {case!r} has no results in {store.folder}: run it first, with `pse run {case}` "
-            f"or pse_analysis.pipeline.run({case!r})"
+            f"case {case!r} has no results in {folder}: run it first, with `pse run {case}` or "
+            f"pse_analysis.pipeline.run({case!r})"
         )
-    return _results(found, options.data_folder / "raw" / found.name, entries)
+    if not older and set(entries) <= set(outdated):
+        stage = next(iter(outdated))
+        raise TableError(
+            f"all results of case {case!r} in {folder} are older than what they were made from "
+            f"({stage}: {outdated[stage]}): `pse run {case}` brings them up to date, "
+            f"load({case!r}, older=True) shows them as they are"
+        )
+    raw_folder = options.data_folder / "raw" / found.name
+    return _results(found, raw_folder, entries, outdated, shown=older)
+
+
+def stored(case: Case, options: Options) -> tuple[dict[str, Entry], dict[str, str]]:
+    """Whole results of a case by stage, and which of them are older than the rest, and why."""
+    store = Store(options.data_folder / "processed" / case.name)
+    entries = {name: entry for name, entry in store.entries().items() if not entry.damaged()}
+    raw = RawFolder(options.data_folder / "raw" / case.name)
+    files = raw.describe(store.raw_files()) if raw.occupied else {}
+    return entries, descent.older(case, entries, files, raw.marker())
 
 
 def run(
@@ -192,7 +270,7 @@ def run(
         until=until, force=force, workers=workers, data=_path(data), cases=_path(cases)
     )
     result = runner.run(case, options, reporter)
-    return _results(result.case, result.raw, result.entries)
+    return _results(result.case, result.raw, result.entries, result.older)
 
 
 def _path(path: str | Path | None) -> Path | None:

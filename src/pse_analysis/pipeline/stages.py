@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
-import pyarrow.parquet as pq
 
 from pse_analysis import recording
 from pse_analysis.alignment import AlignParams, align
@@ -25,7 +24,7 @@ from pse_analysis.pipeline.case import Case
 from pse_analysis.pipeline.plan import SUMMARY, Job, Work
 from pse_analysis.pipeline.processes import each
 from pse_analysis.pipeline.summary import markdown, text
-from pse_analysis.pipeline.tables import merge_files, read_raw_table, write_empty
+from pse_analysis.pipeline.tables import find_raw_table
 from pse_analysis.recording import Take
 from pse_analysis.scoring import ScoreParams, observers, score
 from pse_analysis.simulation import (
@@ -37,9 +36,16 @@ from pse_analysis.simulation import (
     simulate_machine,
     simulate_series,
 )
-from pse_analysis.telemetry import read_model, read_raw, read_table, write_raw, write_table
+from pse_analysis.telemetry import (
+    read_model,
+    read_raw,
+    read_raw_table,
+    read_table,
+    write_table,
+)
+from pse_analysis.telemetry.parquet import merge_files, read_rows, read_trials
+from pse_analysis.telemetry.tables import write_files
 from pse_analysis.validation import ValidateParams, validate
-from pse_analysis.vocabulary import check
 
 PARTS = ("estimated", "residuals", "steps")
 
@@ -125,13 +131,13 @@ def _simulate(job: Job) -> None:
         job.progress(0, 2, "moving the machine")
         raw = simulate_machine(params.machine, params.study, params.simulate)
         job.progress(1, 2, "writing")
-        write_raw(job.output, raw)
+        write_files(job.output, raw)
         return
     if isinstance(params.simulate, SeriesSimulateParams):
         job.progress(0, 2, "drawing loads and faults")
         raw = simulate_series(profiles.load(job.profiles), params.study, params.simulate)
         job.progress(1, 2, "writing")
-        write_raw(job.output, raw)
+        write_files(job.output, raw)
         return
     assert params.simulate is not None
     assert job.case.grid is not None
@@ -141,7 +147,7 @@ def _simulate(job: Job) -> None:
     job.progress(1, 3, "drawing truth, samples and faults")
     raw = simulate(network, curves, params.study, params.simulate)
     job.progress(2, 3, "writing")
-    write_raw(job.output, raw)
+    write_files(job.output, raw)
 
 
 def _validate(job: Job) -> None:
@@ -158,7 +164,7 @@ def _validate(job: Job) -> None:
         model=raw.model,
     )
     job.progress(2, 4, "writing")
-    write_table(job.output / "validated.parquet", validated, "validated")
+    write_table(job.output / "validated.parquet", validated, "validated", job.provenance)
     job.progress(3, 4, "recording")
     recording.validated(
         Take(job.output / "validate.rrd", job.case.name, params.study),
@@ -177,13 +183,13 @@ def _align(job: Job) -> None:
     job.progress(1, 4, "bringing samples to instants")
     aligned = align(validated, channels, model, params.study, params.align)
     job.progress(2, 4, "writing")
-    write_table(job.output / "aligned.parquet", aligned, "aligned")
+    write_table(job.output / "aligned.parquet", aligned, "aligned", job.provenance)
     job.progress(3, 4, "recording")
     recording.aligned(
         Take(job.output / "align.rrd", job.case.name, params.study),
         aligned,
         channels,
-        truth=read_raw_table(job.raw, "truth"),
+        truth=find_raw_table(job.raw, "truth"),
     )
 
 
@@ -207,10 +213,7 @@ class EstimateTask:
 def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
     """Run one method on one trial; returns the file of each table."""
     # Other trials stay on the disk; which variant to take is the method's business.
-    aligned = check(
-        "aligned",
-        pq.read_table(task.aligned, filters=[("trial", "==", task.trial)]).to_pandas(),
-    )
+    aligned = read_rows(task.aligned, "aligned", trial=task.trial)
     try:
         done = estimate(
             aligned,
@@ -219,7 +222,7 @@ def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
             task.study,
             task.method,
             trial=task.trial,
-            truth=read_raw_table(task.raw, "truth"),
+            truth=find_raw_table(task.raw, "truth"),
         )
     except PseError as error:
         raise type(error)(f"method {task.method.name!r}: {error}") from error
@@ -232,10 +235,10 @@ def _estimate(job: Job) -> None:
     params = check_case(job.case)
     if not params.estimate.methods:
         for table in PARTS:
-            write_empty(job.output / f"{table}.parquet", table)
+            merge_files([], job.output / f"{table}.parquet", table, job.provenance)
         return
     aligned = job.inputs["align"] / "aligned.parquet"
-    trials = sorted(set(pq.read_table(aligned, columns=["trial"])["trial"].unique().to_pylist()))
+    trials = read_trials(aligned)
     tasks = [
         EstimateTask(params.study, method, number, trial, job.raw, aligned, job.output)
         for number, method in enumerate(params.estimate.methods)
@@ -246,7 +249,8 @@ def _estimate(job: Job) -> None:
     for done, _ in enumerate(each(run_estimate_task, tasks, job.workers), 1):
         job.progress(done, total, f"{done} of {len(tasks)} estimates")
     for table in PARTS:
-        merge_files([task.part(table) for task in tasks], job.output / f"{table}.parquet")
+        parts = [task.part(table) for task in tasks]
+        merge_files(parts, job.output / f"{table}.parquet", table, job.provenance)
     job.progress(len(tasks), total, "recording")
     tables = {name: read_table(job.output / f"{name}.parquet", name) for name in PARTS}
     model = read_model(job.raw)
@@ -257,7 +261,7 @@ def _estimate(job: Job) -> None:
             tables["steps"],
             aligned=read_table(aligned, "aligned"),
             channels=_channels(job.raw),
-            truth=read_raw_table(job.raw, "truth"),
+            truth=find_raw_table(job.raw, "truth"),
         )
         return
     recording.estimated(
@@ -268,14 +272,14 @@ def _estimate(job: Job) -> None:
         aligned=read_table(aligned, "aligned"),
         channels=_channels(job.raw),
         network=model,
-        truth=read_raw_table(job.raw, "truth"),
+        truth=find_raw_table(job.raw, "truth"),
     )
 
 
 def _score(job: Job) -> None:
     params = check_case(job.case)
     job.progress(0, 3, "reading")
-    truth, faults = read_raw_table(job.raw, "truth"), read_raw_table(job.raw, "faults")
+    truth, faults = find_raw_table(job.raw, "truth"), find_raw_table(job.raw, "faults")
     validated = read_table(job.inputs["validate"] / "validated.parquet", "validated")
     tables = {name: read_table(job.inputs["estimate"] / f"{name}.parquet", name) for name in PARTS}
     job.progress(1, 3, "comparing with the truth")
@@ -296,7 +300,7 @@ def _score(job: Job) -> None:
         params.score,
         expected=expected,
     )
-    write_table(job.output / "scored.parquet", scored, "scored")
+    write_table(job.output / "scored.parquet", scored, "scored", job.provenance)
     told = account.of_run(
         list(_channels(job.raw)["channel"]), validated, tables["steps"], tables["residuals"]
     )
@@ -331,7 +335,7 @@ def _score(job: Job) -> None:
 
 
 def _channels(raw: Path) -> pd.DataFrame:
-    return read_table(raw / "channels.parquet", "channels")
+    return read_raw_table(raw, "channels")
 
 
 WORK: Work = MappingProxyType(

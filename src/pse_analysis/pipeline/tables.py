@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
-from pse_analysis.telemetry import read_model, read_table, read_telemetry
-from pse_analysis.telemetry.tables import arrow_type
-from pse_analysis.vocabulary import schema
+from pse_analysis.telemetry import read_model, read_raw_table, read_telemetry
 
 
 def read_network(raw: Path) -> Network:
@@ -45,26 +40,10 @@ def read_machine(raw: Path) -> Machine:
     return model
 
 
-def read_raw_table(raw: Path, table: str) -> pd.DataFrame | None:
-    """A table of a raw folder; None if it is one that only simulations know and is not there."""
+def find_raw_table(raw: Path, table: str) -> pd.DataFrame | None:
+    """Return a table of a raw folder; None where one that only simulations know is not there."""
     if table == "telemetry":
         return read_telemetry(raw)
-    path = raw / f"{table}.parquet"
-    if table != "channels" and not path.is_file():
+    if table != "channels" and not (raw / f"{table}.parquet").is_file():
         return None
-    return read_table(path, table)
-
-
-def write_empty(path: Path, table: str) -> None:
-    """Write a table without rows."""
-    fields = [(name, arrow_type(c.dtype)) for name, c in schema(table).columns.items()]
-    pq.write_table(pa.schema(fields).empty_table(), path, compression="zstd")
-
-
-def merge_files(paths: Sequence[Path], target: Path) -> None:
-    """Join parquet files of one schema, one after another, and remove them."""
-    form = pq.read_schema(paths[0])
-    with pq.ParquetWriter(target, form, compression="zstd") as writer:
-        for path in paths:
-            writer.write_table(pq.ParquetFile(path).read())
-            path.unlink()
+    return read_raw_table(raw, table)

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 from pse_analysis.telemetry.channels import check_channels, check_shunts
 from pse_analysis.telemetry.ingestion import ingest
+from pse_analysis.telemetry.parquet import read_provenance, read_table, write_table
 from pse_analysis.telemetry.tables import (
     RawCase,
+    accept,
     read_model,
     read_raw,
-    read_table,
+    read_raw_table,
     read_telemetry,
     write_raw,
-    write_table,
 )
 
 __all__ = [
     "RawCase",
+    "accept",
     "check_channels",
     "check_shunts",
     "ingest",
     "read_model",
+    "read_provenance",
     "read_raw",
+    "read_raw_table",
     "read_table",
     "read_telemetry",
     "write_raw",

@@ -12,8 +12,9 @@ bytes.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Collection
+import os
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,14 +22,23 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from pse_analysis import files
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.measurement import Model
 from pse_analysis.telemetry.channels import check_channels, check_known
-from pse_analysis.vocabulary import check, schema
+from pse_analysis.telemetry.parquet import (
+    read_arrow,
+    read_columns,
+    read_table,
+    to_pandas,
+    write_arrow,
+    write_checked,
+    write_table,
+)
+from pse_analysis.vocabulary import check
 
 GRID_TABLES = ("network", "buses", "branches")
 OPTIONAL_TABLES = ("truth", "sample_truth", "faults")
@@ -69,128 +79,16 @@ class RawCase:
         return self.model
 
 
-def arrow_type(dtype: object) -> pa.DataType:
-    """Arrow type of a column's type in `pse_analysis.vocabulary.schema`; text has none there."""
-    if dtype is None:
-        return pa.string()
-    name = str(dtype)
-    if name.startswith("datetime64"):
-        return pa.timestamp("us", tz="UTC")
-    if name == "bool":
-        return pa.bool_()
-    return pa.type_for_alias(name.lower())
-
-
-def write_table(path: str | Path, frame: pd.DataFrame, table: str) -> None:
-    """Write a table to one parquet file, checked against its schema.
-
-    Equal frames give equal bytes.
-
-    Raises
-    ------
-    TableError
-        If the frame breaks the schema.
-    """
-    _write(Path(path), check(table, frame), table)
-
-
-def _write(path: Path, frame: pd.DataFrame, table: str) -> None:
-    fields = [(name, arrow_type(c.dtype)) for name, c in schema(table).columns.items()]
-    arrow = pa.Table.from_pandas(frame, schema=pa.schema(fields), preserve_index=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Without pandas' metadata the file says nothing about who wrote it.
-    pq.write_table(arrow.replace_schema_metadata(None), path, compression="zstd")
-
-
-def read_table(path: str | Path, table: str) -> pd.DataFrame:
-    """Read one parquet file as a table, checked against its schema.
-
-    Narrower numbers, other time resolutions and dictionary-encoded names are accepted and
-    widened; anything else must have the schema's type.
-
-    Raises
-    ------
-    TableError
-        If the file is missing, cut short, or does not fit the schema.
-    """
-    return check(table, _to_pandas(_read(Path(path), table)))
-
-
-def _read(path: Path, table: str) -> pa.Table:
-    if not path.is_file():
-        raise TableError(
-            f"{table}: no file {path}; write it with pse_analysis.telemetry.write_raw, or run the "
-            "case's simulation"
-        )
-    try:
-        arrow = pq.ParquetFile(path).read()
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, OSError) as error:
-        raise TableError(
-            f"{table}: {path} is not a whole parquet file ({error}); it was cut short or damaged: "
-            "copy or write it again"
-        ) from error
-    expected = {name: arrow_type(c.dtype) for name, c in schema(table).columns.items()}
-    missing = [name for name in expected if name not in arrow.column_names]
-    if missing:
-        raise TableError(
-            f"{table}: column {missing[0]!r} is missing in {path}; expected columns "
-            f"{', '.join(expected)}; received {', '.join(arrow.column_names)}"
-        )
-    columns = [
-        _cast(arrow.column(name), kind, f"{table}: column {name!r} of {path}")
-        for name, kind in expected.items()
-    ]
-    return pa.Table.from_arrays(columns, names=list(expected))
-
-
-def _cast(column: pa.ChunkedArray, wanted: pa.DataType, what: str) -> pa.ChunkedArray:
-    given = column.type
-    if given == wanted:
-        return column
-    types = pa.types
-    if types.is_timestamp(wanted) and types.is_timestamp(given) and given.tz is None:
-        raise TableError(
-            f"{what} has no time zone: expected {wanted}, received {given}; bring the table in "
-            "with pse_analysis.telemetry.ingest(..., timezone='Europe/Berlin')"
-        )
-    if types.is_dictionary(given):
-        return _cast(column.cast(given.value_type), wanted, what)
-    alike = (
-        (types.is_timestamp(wanted) and types.is_timestamp(given))
-        or (types.is_string(wanted) and types.is_large_string(given))
-        or (types.is_integer(wanted) and types.is_integer(given))
-        or (types.is_floating(wanted) and (types.is_floating(given) or types.is_integer(given)))
-        or types.is_null(given)
-    )
-    if alike:
-        try:
-            # Nanoseconds below the microsecond are nobody's clock.
-            return column.cast(wanted, safe=not types.is_timestamp(wanted))
-        except pa.ArrowInvalid as error:
-            raise TableError(
-                f"{what} does not fit {wanted}: {error}; convert it before writing"
-            ) from error
-    raise TableError(
-        f"{what}: expected {wanted}, received {given}; bring the table in with "
-        "pse_analysis.telemetry.ingest, or write the column with that type"
-    )
-
-
-def _to_pandas(arrow: pa.Table) -> pd.DataFrame:
-    nullable = {pa.int16(): pd.Int16Dtype()}
-    if "kind" in arrow.column_names:
-        nullable[pa.int64()] = pd.Int64Dtype()
-    frame: pd.DataFrame = arrow.to_pandas(types_mapper=nullable.get)
-    return frame
-
-
 def write_raw(folder: str | Path, raw: RawCase) -> None:
     """Write a raw case into a folder that holds none yet, whole or not at all.
 
+    ``checksums.json`` in it lists what was written; a file that differs later is refused.
+
     Raises
     ------
     TableError
-        If the folder already holds telemetry, or a table breaks its schema.
+        If the folder already holds telemetry or any other of the files, or a table breaks its
+        schema.
     """
     folder = Path(folder).resolve()
     if (folder / "telemetry").exists():
@@ -198,37 +96,89 @@ def write_raw(folder: str | Path, raw: RawCase) -> None:
             f"{folder} already holds telemetry, which is never overwritten: choose another "
             "folder, or remove that one first"
         )
+    part = folder.with_name(f".{folder.name}.tmp-{os.getpid()}")
+    _sweep(folder)
+    try:
+        write_files(part, raw)
+        files.write_checksums(part)
+        files.flush_folder(part)
+        if folder.exists():
+            _move(part, folder)
+        else:
+            part.replace(folder)
+        files.flush(folder.parent)
+    finally:
+        files.remove_own(part, _is_own)
+
+
+def _move(part: Path, folder: Path) -> None:
+    """Bring written files into a folder that is there.
+
+    Telemetry comes last: without it nothing reads the folder.
+    """
+    names = [path.relative_to(part) for path in files.files_below(part)]
+    taken = [name for name in names if os.path.lexists(folder / name)]
+    if taken:
+        raise TableError(
+            f"{folder / taken[0]} is there already and is not overwritten: choose another folder, "
+            "or remove that file first"
+        )
+    for name in names:
+        if name.parts[0] != "telemetry":
+            (folder / name).parent.mkdir(exist_ok=True)
+            (part / name).replace(folder / name)
+    (part / "telemetry").replace(folder / "telemetry")
+
+
+_OWN = re.compile(
+    r"telemetry/source=[^/]+/date=[^/]+/part-0\.parquet|grid/[a-z]+\.parquet|[a-z_]+\.parquet"
+    r"|checksums\.json|\.checksums\.json\.tmp-\d+"
+)
+
+
+def _is_own(name: str) -> bool:
+    return _OWN.fullmatch(name) is not None
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what writers of the same folder left when they were killed."""
+    if folder.parent.is_dir():
+        for path in list(folder.parent.iterdir()):
+            if path.name.startswith(f".{folder.name}.tmp-") and files.is_orphan(path):
+                files.remove_own(path, _is_own)
+
+
+def accept(folder: str | Path) -> None:
+    """List anew the files of a raw folder, after a change that was meant.
+
+    Every table must be whole; from then on the folder counts as it is now.
+
+    Raises
+    ------
+    TableError
+        If a table is missing, damaged, or breaks its schema.
+    """
+    folder = Path(folder)
+    _read_raw(folder, {})
+    files.write_checksums(folder)
+
+
+def write_files(folder: Path, raw: RawCase) -> None:
+    """Write the files of a raw case one by one, for a folder that nobody reads yet.
+
+    Raises
+    ------
+    TableError
+        If a table breaks its schema.
+    """
     channels = check_channels(raw.channels, raw.model)
     telemetry = check("telemetry", raw.telemetry)
     check_known(telemetry, channels)
-    part = folder.with_name(f".{folder.name}.part")
-    # What a killed writer left is nobody's.
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        _write_folder(part, raw, channels, telemetry)
-        if folder.exists():
-            # Telemetry comes last: without it nothing reads the folder.
-            for path in [
-                p for p in part.rglob("*.parquet") if p.relative_to(part).parts[0] != "telemetry"
-            ]:
-                target = folder / path.relative_to(part)
-                target.parent.mkdir(exist_ok=True)
-                path.replace(target)
-            (part / "telemetry").replace(folder / "telemetry")
-        else:
-            part.replace(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def _write_folder(
-    folder: Path, raw: RawCase, channels: pd.DataFrame, telemetry: pd.DataFrame
-) -> None:
     for table in OPTIONAL_TABLES:
         frame = getattr(raw, table)
         if frame is not None:
             write_table(folder / f"{table}.parquet", frame, table)
-    _write(folder / "channels.parquet", channels, "channels")
+    write_checked(folder / "channels.parquet", channels, "channels")
     tables = (
         {"machine": raw.model.to_table()}
         if isinstance(raw.model, Machine)
@@ -237,8 +187,7 @@ def _write_folder(
     for name, frame in tables.items():
         path = folder / f"{name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrow = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata(None)
-        pq.write_table(arrow, path, compression="zstd")
+        write_arrow(path, pa.Table.from_pandas(frame, preserve_index=False))
     _write_partitions(folder / "telemetry", telemetry, channels)
 
 
@@ -259,7 +208,7 @@ def _write_partitions(folder: Path, telemetry: pd.DataFrame, channels: pd.DataFr
         part = telemetry.iloc[order[first:last]]
         date = np.datetime64(int(key[1, first]), "D")
         path = folder / f"source={sources[key[0, first]]}" / f"date={date}" / "part-0.parquet"
-        _write(path, part, "telemetry")
+        write_checked(path, part, "telemetry")
 
 
 def read_telemetry(
@@ -286,28 +235,41 @@ def read_telemetry(
     TableError
         If there is no such data, or a file does not fit; the message names it.
     """
-    root = Path(folder) / "telemetry"
+    folder = Path(folder)
+    return _read_telemetry(folder, files.read_checksums(folder), sources, dates)
+
+
+def _read_telemetry(
+    folder: Path,
+    listed: Mapping[str, files.Facts],
+    sources: Collection[str] | None = None,
+    dates: Collection[str] | None = None,
+) -> pd.DataFrame:
+    root = folder / "telemetry"
     if not root.is_dir():
         raise TableError(
             f"telemetry: no folder {root}; write it with pse_analysis.telemetry.write_raw, or run "
             "the case's simulation"
         )
-    files = [
+    files.refuse_links(folder, ["telemetry"])
+    paths = [
         path
         for path in sorted(root.glob("source=*/date=*/*.parquet"))
         if (sources is None or path.parts[-3].removeprefix("source=") in sources)
         and (dates is None or path.parts[-2].removeprefix("date=") in dates)
     ]
-    if not files:
+    if not paths:
         asked = f" for sources {sources or 'all'} and dates {dates or 'all'}"
         raise TableError(
             f"telemetry: {root} holds no source=…/date=…/*.parquet{asked}; there are "
             f"{', '.join(sorted(p.name for p in root.glob('source=*'))) or 'none'}"
         )
-    arrow = pa.concat_tables([_read(path, "telemetry") for path in files])
+    arrow = pa.concat_tables(
+        [read_columns(_checked(path, folder, listed), "telemetry") for path in paths]
+    )
     if not arrow.num_rows:
-        raise TableError(f"telemetry: the {len(files)} files in {root} are empty; expected samples")
-    frame = _to_pandas(arrow)
+        raise TableError(f"telemetry: the {len(paths)} files in {root} are empty; expected samples")
+    frame = to_pandas(arrow)
     code, names = pd.factorize(frame["channel"])
     rank = np.argsort(np.argsort(names.astype(str)))[code]
     order = np.lexsort((frame["seq"], rank, frame["trial"]))
@@ -329,20 +291,40 @@ def read_raw(folder: str | Path) -> RawCase:
             "machine.parquet in it: write it with pse_analysis.telemetry.write_raw, or run the "
             "case's simulation"
         )
-    model = read_model(folder)
-    channels = check_channels(_to_pandas(_read(folder / "channels.parquet", "channels")), model)
-    telemetry = read_telemetry(folder)
+    return _read_raw(folder, files.read_checksums(folder))
+
+
+def _read_raw(folder: Path, listed: Mapping[str, files.Facts]) -> RawCase:
+    model = _read_model(folder, listed)
+    channels = check_channels(
+        to_pandas(read_columns(_checked(folder / "channels.parquet", folder, listed), "channels")),
+        model,
+    )
+    telemetry = _read_telemetry(folder, listed)
     check_known(telemetry, channels)
     optional = {
-        table: read_table(folder / f"{table}.parquet", table)
+        table: read_table(_checked(folder / f"{table}.parquet", folder, listed), table)
         for table in OPTIONAL_TABLES
         if (folder / f"{table}.parquet").is_file()
     }
     return RawCase(model, channels, telemetry, **optional)
 
 
+def read_raw_table(folder: str | Path, table: str) -> pd.DataFrame:
+    """Read one of the tables of a raw folder that stand in a single file.
+
+    Raises
+    ------
+    TableError
+        If it is missing, damaged, or breaks its schema.
+    """
+    folder = Path(folder)
+    listed = files.read_checksums(folder)
+    return read_table(_checked(folder / f"{table}.parquet", folder, listed), table)
+
+
 def read_model(folder: str | Path) -> Model:
-    """The grid or machine of a raw folder.
+    """Read the grid or machine of a raw folder.
 
     Raises
     ------
@@ -350,23 +332,31 @@ def read_model(folder: str | Path) -> Model:
         If one of its files is missing or not whole.
     """
     folder = Path(folder)
+    return _read_model(folder, files.read_checksums(folder))
+
+
+def _read_model(folder: Path, listed: Mapping[str, files.Facts]) -> Model:
     if (folder / "machine.parquet").is_file():
-        return Machine.from_table(_read_model_table(folder / "machine.parquet"))
+        return Machine.from_table(_read_model_table(folder, "machine.parquet", listed))
     return Network.from_tables(
-        **{n: _read_model_table(folder / "grid" / f"{n}.parquet") for n in GRID_TABLES}
+        **{n: _read_model_table(folder, f"grid/{n}.parquet", listed) for n in GRID_TABLES}
     )
 
 
-def _read_model_table(path: Path) -> pd.DataFrame:
+def _read_model_table(folder: Path, name: str, listed: Mapping[str, files.Facts]) -> pd.DataFrame:
+    path = folder / name
     if not path.is_file():
         raise TableError(
             f"grid: no file {path}; expected {', '.join(f'{n}.parquet' for n in GRID_TABLES)} in "
             "grid/, or machine.parquet: write them with pse_analysis.telemetry.write_raw"
         )
-    try:
-        frame: pd.DataFrame = pq.ParquetFile(path).read().to_pandas()
-    except (pa.ArrowInvalid, OSError) as error:
-        raise TableError(
-            f"grid: {path} is not a whole parquet file ({error}): copy or write it again"
-        ) from error
-    return frame
+    arrow = read_arrow(_checked(path, folder, listed))
+    return to_pandas(arrow.replace_schema_metadata(None))
+
+
+def _checked(path: Path, folder: Path, listed: Mapping[str, files.Facts]) -> Path:
+    """The path of a raw file, once it is seen to be as it was written."""
+    facts = listed.get(path.relative_to(folder).as_posix())
+    if facts is not None and path.is_file():
+        files.check(path, facts, files.accept(folder))
+    return path
