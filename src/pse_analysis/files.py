@@ -20,6 +20,9 @@ from pse_analysis.errors import DamagedFile, TableError
 CHECKSUMS = "checksums.json"
 """File in a raw folder that lists size and digest of every table in it."""
 
+SIMULATED = "simulated.json"
+"""File in a raw folder that a simulation made."""
+
 DIGEST_BYTES = 16
 MAX_JSON_BYTES = 64 * 2**20
 
@@ -277,6 +280,8 @@ def read_checksums(folder: Path) -> dict[str, Facts]:
 
 def accept(folder: Path) -> str:
     """What to do about a raw file that differs from its checksum."""
+    if (folder / SIMULATED).is_file():
+        return f"`pse run {folder.name} --force` simulates it again"
     return (
         "restore it from a copy; or, if the change is yours, accept it with `pse verify "
         f"{folder.name} --accept` or pse_analysis.telemetry.accept({str(folder)!r})"

@@ -14,6 +14,7 @@ from typing import Any
 from pse_analysis.errors import DamagedFile
 from pse_analysis.files import (
     CHECKSUMS,
+    SIMULATED,
     Facts,
     accept,
     describe_folder,
@@ -30,12 +31,10 @@ from pse_analysis.files import (
 from pse_analysis.pipeline.cache import CacheError
 from pse_analysis.pipeline.plan import STAGES
 
-MARKER = "simulated.json"
-
 READ = frozenset(name for stage in STAGES for name in stage.raw)
 """Files and folders in it that stages read."""
 
-_LISTS = (MARKER, CHECKSUMS)
+_LISTS = (SIMULATED, CHECKSUMS)
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class RawFolder:
 
     def marker(self) -> Mapping[str, Any] | None:
         """What the simulation noted about itself; None if it did not make this folder."""
-        path = self.folder / MARKER
+        path = self.folder / SIMULATED
         return read_json(path) if path.is_file() else None
 
     def changed(self, files: Mapping[str, Facts]) -> str | None:
@@ -149,7 +148,7 @@ class RawFolder:
             "parameters": dict(parameters),
             "seconds": round(seconds, 3),
         }
-        write_json(temporary / MARKER, marker)
+        write_json(temporary / SIMULATED, marker)
         flush_folder(temporary)
         if self.folder.exists():
             os.rename(self.folder, self._old)
@@ -199,7 +198,7 @@ def _is_raw(name: str) -> bool:
 def foreign(folder: Path) -> str:
     """Why a simulation leaves a raw folder alone, and what to do."""
     return (
-        f"{folder} was not made by a simulation (it has no {MARKER}), so it is not overwritten: "
+        f"{folder} was not made by a simulation (it has no {SIMULATED}), so it is not overwritten: "
         "move it away to simulate the case, or remove grid and [simulate] from the case file to "
         "use it"
     )

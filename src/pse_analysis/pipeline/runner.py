@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from pse_analysis import __version__
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.files import Facts, describe_folder, unchanged
+from pse_analysis.files import SIMULATED, Facts, describe_folder, unchanged
 from pse_analysis.pipeline.cache import CacheError, Entry, Store, lock
 from pse_analysis.pipeline.case import Case, load_case, project_root
 from pse_analysis.pipeline.descent import inputs, older, read_parameters
@@ -40,7 +40,7 @@ from pse_analysis.pipeline.plan import (
     Stage,
     Work,
 )
-from pse_analysis.pipeline.raw_folder import MARKER, RawFolder, foreign
+from pse_analysis.pipeline.raw_folder import RawFolder, foreign
 
 T = TypeVar("T")
 
@@ -171,7 +171,7 @@ class _Run:
             if changed is not None and not forced:
                 raise CacheError(
                     f"{folder / changed} is not as the simulation wrote it: --force simulates "
-                    f"again and loses the change; to keep it, remove {folder / MARKER} and the "
+                    f"again and loses the change; to keep it, remove {folder / SIMULATED} and the "
                     "case file's grid and [simulate]"
                 )
             if marker.get("fingerprint") == key and not forced:

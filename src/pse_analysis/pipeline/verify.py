@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pse_analysis.errors import DamagedFile, PseError
-from pse_analysis.files import CHECKSUMS, Facts, files_below, read_checksums, unchanged
+from pse_analysis.files import CHECKSUMS, SIMULATED, Facts, files_below, read_checksums, unchanged
 from pse_analysis.pipeline.cache import MANIFEST, Entry, Store
 from pse_analysis.pipeline.case import Case
 from pse_analysis.pipeline.descent import older
 from pse_analysis.pipeline.plan import NAMES, Options
-from pse_analysis.pipeline.raw_folder import MARKER, RawFolder
+from pse_analysis.pipeline.raw_folder import RawFolder
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _raw(raw: RawFolder) -> Iterator[Finding]:
             yield Finding(path, f"{what}: {remedy}", True)
     for path in files_below(raw.folder):
         name = path.relative_to(raw.folder).as_posix()
-        if listed and name not in (*listed, CHECKSUMS, MARKER):
+        if listed and name not in (*listed, CHECKSUMS, SIMULATED):
             yield Finding(path, "was added since", False)
 
 
