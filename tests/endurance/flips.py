@@ -53,9 +53,7 @@ def uses(options: Options) -> Iterator[tuple[Path, Use]]:
         yield path, lambda: telemetry.read_raw(raw)
 
 
-def unnoticed(
-    path: Path, use: Callable[[], Use], count: int, generator: np.random.Generator
-) -> int:
+def unnoticed(path: Path, use: Use, count: int, generator: np.random.Generator) -> int:
     """Number of turned bits of a file after which its numbers were used all the same.
 
     Size and time of the file stay as they were: damage of a disk moves neither.

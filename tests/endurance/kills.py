@@ -34,6 +34,7 @@ from pse_analysis.pipeline.case import load_case
 from pse_analysis.pipeline.plan import NAMES, Options
 from pse_analysis.pipeline.results import load
 from pse_analysis.pipeline.verify import verify
+from pse_analysis.vocabulary import KEYS, schema
 
 CASE = Path(__file__).parents[1] / "cases" / "small.toml"
 SEED = 1147
@@ -155,7 +156,7 @@ def complete(options: Options) -> dict[str, str]:
 
 
 class Killer:
-    """Kills runs of one case, again and again, and keeps account of what they met."""
+    """Kills runs of one case, again and again, and counts what they met."""
 
     def __init__(self, folder: Path, seed: int = SEED, edits: int = len(EDITS)) -> None:
         self._draw = np.random.default_rng(seed)
@@ -253,6 +254,8 @@ class Killer:
 def main(count: int, seed: int = SEED) -> int:
     """Kill as often as that in a temporary folder and print what was met; returns an exit code."""
     assert pse_analysis.pipeline.stages.WORK.keys() == set(NAMES)
+    for table in KEYS:
+        schema(table)
     with tempfile.TemporaryDirectory() as folder:
         # Each edit costs an undisturbed run to compare with.
         killer = Killer(Path(folder), seed, edits=max(2, count // 20))

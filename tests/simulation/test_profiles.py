@@ -136,7 +136,9 @@ def test_missing_or_broken_profiles_say_what_to_do(tmp_path: Path):
     with pytest.raises(TableError, match="pass the data folder"):
         profiles.load(tmp_path)
     (tmp_path / profiles.FILE).write_bytes(b"PAR1 cut short")
-    with pytest.raises(TableError, match="cannot be read as parquet"):
+    with pytest.raises(
+        TableError, match="not a whole parquet file.*restore it from the repository"
+    ):
         profiles.load(tmp_path)
     frame = pd.read_parquet(FOLDER / profiles.FILE)
     frame.drop(index=5).to_parquet(tmp_path / profiles.FILE)

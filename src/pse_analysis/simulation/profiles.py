@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from scipy.linalg import solve_toeplitz
 
 from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.files import check, read_checksums
+from pse_analysis.telemetry.parquet import read_arrow, to_pandas
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,13 +53,14 @@ def load(folder: str | Path) -> pd.DataFrame:
             f"load profiles: no file {path}; expected the folder data/raw/load_profiles of this "
             "project: pass the data folder it lies in"
         )
+    remedy = "restore it from the repository, or run take_extract.py beside it"
+    listed = read_checksums(path.parent)
+    if path.name in listed:
+        check(path, listed[path.name], remedy)
     try:
-        frame = pq.read_table(path).to_pandas()
-    except (pa.ArrowInvalid, OSError) as error:
-        raise TableError(
-            f"load profiles: {path} cannot be read as parquet ({error}); restore it from the "
-            "repository or run take_extract.py beside it"
-        ) from error
+        frame = to_pandas(read_arrow(path))
+    except TableError as error:
+        raise TableError(f"load profiles: {error}; {remedy}") from error
     if "time_utc" not in frame.columns:
         raise TableError(
             f"load profiles: {path} lacks the column 'time_utc'; received "
