@@ -2,6 +2,7 @@
 # make notebooks             open the notebooks in JupyterLab
 # make view [CASE=name]      open a case's recordings in the Rerun viewer
 # make test                  everything that CI checks
+# make endurance             hours of kills, turned bits and mutated inputs
 # make install               create .venv with the pinned development tools
 
 CASE ?= ieee33
@@ -12,7 +13,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c c
 NOTEBOOKS := $(wildcard notebooks/*.ipynb)
 
 .DEFAULT_GOAL := run
-.PHONY: run notebooks view test lint types tests cases-all notebook-tests install clean
+.PHONY: run notebooks view test lint types tests cases-all notebook-tests endurance install clean
 
 run: $(VENV)/.runtime
 	@$(BIN)/pse run $(CASE)
@@ -44,6 +45,12 @@ notebook-tests: $(VENV)/.dev cases-all
 
 tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 tests
+
+# What it found last, on which machine and when: docs/reliability.md.
+endurance: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance kills --count $(or $(KILLS),1000)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance flips --count $(or $(FLIPS),10000)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance mutations --count $(or $(MUTATIONS),100000)
 
 clean:
 	rm -rf $(VENV) data/processed/*/ .pytest_cache .mypy_cache .ruff_cache
