@@ -6,13 +6,14 @@ import dataclasses
 import fnmatch
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pandas as pd
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.measurement import Model, SensorLayout
+from pse_analysis.validation.default_limits import DefaultLimits, physical_limits
 from pse_analysis.validation.thresholds import DEFAULT_AMPLITUDE
 from pse_analysis.vocabulary import UNITS, Quantity, plain_unit
 
@@ -49,8 +50,8 @@ class Rule:
         Unit of ``lower``, ``upper`` and ``increment``, any that the quantity has. Default: each
         channel's own, which after `pse_analysis.telemetry.ingest` is that of its quantity's name.
     lower, upper : float
-        Limits in place of those in the table of channels. A voltage magnitude must be above 0
-        whatever they say.
+        Limits in place of those in the table of channels; ``inf`` for none. Where neither states
+        one, `DefaultLimits` do. A voltage magnitude must be above 0 whatever they say.
     increment : float
         Given threshold γ of the first increment over one sampling period, in place of a learnt
         one; √m times as large over m periods.
@@ -184,9 +185,12 @@ class ValidateParams:
     ----------
     rules : tuple of Rule
         Applied in order; a later rule overrides an earlier one field by field.
+    default_limits : DefaultLimits
+        Limits of channels for which neither the table of channels nor a rule states one.
     """
 
     rules: tuple[Rule, ...] = ()
+    default_limits: DefaultLimits = field(default_factory=DefaultLimits)
 
 
 def resolve(
@@ -194,13 +198,15 @@ def resolve(
 ) -> list[Rule]:
     """The rule in force for each channel, limits and increments in the channel's own unit.
 
+    A limit that nobody states is the default one, `physical_limits`.
+
     Parameters
     ----------
     channels : DataFrame
         Of schema ``channels``.
     params : ValidateParams
     model : Network or Machine, optional
-        What turns kV or A into p.u.
+        What turns kV or A into p.u., and what default limits follow from.
 
     Returns
     -------
@@ -214,7 +220,8 @@ def resolve(
     """
     used = [False] * len(params.rules)
     resolved = []
-    for row in channels.itertuples(index=False):
+    default = physical_limits(channels, model, params.default_limits)
+    for at, row in enumerate(channels.itertuples(index=False)):
         source, quantity, channel = str(row.source), str(row.quantity), str(row.channel)
         values: dict[str, Any] = {
             f.name: getattr(DEFAULTS, f.name) for f in dataclasses.fields(Rule)
@@ -233,6 +240,7 @@ def resolve(
                 if f.name in _IN_UNIT:
                     value = value * _scale(rule.unit, row._asdict(), model)
                 values[f.name] = value
+        values["lower"], values["upper"] = default.beside(at, values["lower"], values["upper"])
         if voltage and not (values["lower"] or 0.0) > 0.0:
             values["lower"] = LEAST_VOLTAGE
         values |= {"source": source, "quantity": quantity, "channel": channel}

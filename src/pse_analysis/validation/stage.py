@@ -16,6 +16,7 @@ from pse_analysis.measurement import Model
 from pse_analysis.validation import extrapolation
 from pse_analysis.validation.block import RULED_OUT, Criteria, screen
 from pse_analysis.validation.criteria import decide
+from pse_analysis.validation.default_limits import PhysicalLimits, physical_limits
 from pse_analysis.validation.increments import Structure, learn, unwound
 from pse_analysis.validation.rules import Rule, ValidateParams, resolve
 from pse_analysis.validation.timing import Stamps, time_reasons
@@ -55,13 +56,14 @@ def validate(
     channels : DataFrame
         Of schema ``channels``.
     params : ValidateParams, optional
-        Rules per source, quantity or channel; the defaults check limits from ``channels`` and
-        changes against thresholds learnt from the history.
+        Rules per source, quantity or channel; the defaults check limits from ``channels``, or
+        else physical ones, and changes against thresholds learnt from the history.
     history_end : datetime, optional
         Samples stamped and arrived before it are the history that σ, k and the usual delay are
         learnt from. Without it only stated thresholds are applied.
     model : Network or Machine, optional
-        Needed where a rule is stated in kV or A and its channel in p.u., or the reverse.
+        What the default limits of powers, currents and rotors follow from; without it those have
+        none. Needed where a rule is stated in kV or A and its channel in p.u., or the reverse.
 
     Returns
     -------
@@ -122,7 +124,8 @@ def validate(
             reasons, backward, statistic, threshold,
         )  # fmt: skip
 
-    _warn_of_limits(channels, rules, lane_channel[stamps.lane], value, reasons)
+    default = physical_limits(channels, model, params.default_limits)
+    _warn_of_limits(channels, rules, default, lane_channel[stamps.lane], value, reasons)
 
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
@@ -139,6 +142,7 @@ def validate(
 def _warn_of_limits(
     channels: pd.DataFrame,
     rules: list[Rule],
+    default: PhysicalLimits,
     channel: Ints,
     value: Array,
     reasons: npt.NDArray[np.int32],
@@ -147,12 +151,15 @@ def _warn_of_limits(
     n = len(channels)
     finite = np.bincount(channel[np.isfinite(value)], minlength=n)
     outside = np.bincount(channel[(reasons & Reason.LIMIT) != 0], minlength=n)
-    for at in np.flatnonzero((finite > 0) & (outside >= finite)):
+    for at in map(int, np.flatnonzero((finite > 0) & (outside >= finite))):
+        rule = rules[at]
+        low, high = (limit in (rule.lower, rule.upper) for limit in default.of(at))
         log.warning(
-            "%s: all %d samples lie outside the limits %s … %s %s, e.g. %.4g, and none is used: "
+            "%s: all %d samples lie outside the limits %s … %s %s%s, e.g. %.4g, and none is used: "
             "check limits and unit of the channel, and those of [validate.rules]",
-            *(rules[at].channel, outside[at], rules[at].lower, rules[at].upper),
-            *(channels["unit"].iloc[at], value[(channel == at) & np.isfinite(value)][0]),
+            *(rule.channel, outside[at], rule.lower, rule.upper, channels["unit"].iloc[at]),
+            f" (default: {default.origin[at]})" if low or high else "",
+            value[(channel == at) & np.isfinite(value)][0],
         )
 
 
