@@ -87,15 +87,20 @@ STAGES = (
         "score",
         "pse_analysis.scoring",
         # What theory says of an observer follows from its tuning and the true densities.
-        keys=("title", "machine", "study", "simulate", "estimate", "score"),
-        raw=("grid", "machine.parquet", "truth.parquet", "faults.parquet"),
+        # What was checked of which channel stands in the summary.
+        keys=("title", "machine", "study", "simulate", "validate", "estimate", "score"),
+        raw=("grid", "machine.parquet", "channels.parquet", "truth.parquet", "faults.parquet"),
         tables=(
             ("validate", "validated"),
             ("estimate", "estimated"),
             ("estimate", "residuals"),
             ("estimate", "steps"),
         ),
-        leaves=("pse_analysis.recording", "pse_analysis.pipeline.summary"),
+        leaves=(
+            "pse_analysis.recording",
+            "pse_analysis.pipeline.account",
+            "pse_analysis.pipeline.summary",
+        ),
     ),
 )
 NAMES = tuple(stage.name for stage in STAGES)

@@ -302,9 +302,16 @@ def _score(job: Job) -> None:
     )
     write_table(job.output / "scored.parquet", scored, "scored", job.provenance)
     told = account.of_run(
-        list(_channels(job.raw)["channel"]), validated, tables["steps"], tables["residuals"]
+        _channels(job.raw),
+        validated,
+        tables["steps"],
+        tables["residuals"],
+        study=params.study,
+        params=params.validate,
+        model=model,
     )
-    shown = job.case.title, scored, told, [m.name for m in params.estimate.methods]
+    methods = [m.name for m in params.estimate.methods]
+    shown = job.case.title, scored, told.findings, methods, told.notices
     (job.output / SUMMARY).write_text(text(*shown), encoding="utf-8")
     job.progress(2, 3, "recording")
     if not params.estimate.methods:

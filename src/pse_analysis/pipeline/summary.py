@@ -77,6 +77,7 @@ CHECK_HEAD = (
 
 CHECKED = "What the checks found of the injected faults, all trials together"
 UNITS = "Mean and largest error of |V| in 1e-3 pu, of its angle in 1e-3 degree"
+ATTENTION = "attention"
 NO_TRUTH = "The truth is not known, so there are no errors to show"
 WITH_TRUTH = ("vm_error_mean", "angle_rms")
 MACHINE_UNITS = "RMS error of rotor angle θ and speed ω, and when it settles into ±2σ of theory"
@@ -88,7 +89,11 @@ _MACHINE_SCALE = {"rad": 1e3, "rad/s": 1e3}
 
 
 def text(
-    title: str, scored: pd.DataFrame, account: Sequence[str] = (), order: Sequence[str] = ()
+    title: str,
+    scored: pd.DataFrame,
+    account: Sequence[str] = (),
+    order: Sequence[str] = (),
+    notices: Sequence[str] = (),
 ) -> str:
     """Scores of the methods and of the checks, as plain text.
 
@@ -100,9 +105,11 @@ def text(
         Table of that name; only rows of the whole case (element "") are shown, and trials are
         brought together: largest errors by their maximum, times by their sum, others by their mean.
     account
-        Sentences that follow, `pse_analysis.pipeline.account.of_run`.
+        Sentences that follow, findings of `pse_analysis.pipeline.account.of_run`.
     order
         Methods as they are to stand; by default as they come.
+    notices
+        Sentences to be read before the scores, notices of the same; they stand under the title.
     """
     units, head, rows = _content(scored, order)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
@@ -119,18 +126,31 @@ def text(
         file=stored, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
     )
     width = console.measure(table).maximum
-    for line in (_title(title, scored), units):
-        console.print(Text(line.center(width)))
+    console.print(Text(_title(title, scored).center(width)))
+    for sentence in notices:
+        console.print()
+        console.print(_wrapped(f"{ATTENTION}: {sentence}"))
+    if notices:
+        console.print()
+    console.print(Text(units.center(width)))
     console.print()
     console.print(table)
     console.print()
     for sentence in _closing(scored, account):
-        console.print(Text("\n".join(textwrap.wrap(sentence, WIDTH, subsequent_indent="  "))))
+        console.print(_wrapped(sentence))
     return "\n".join(line.rstrip() for line in stored.getvalue().strip("\n").splitlines()) + "\n"
 
 
+def _wrapped(sentence: str) -> Text:
+    return Text("\n".join(textwrap.wrap(sentence, WIDTH, subsequent_indent="  ")))
+
+
 def markdown(
-    title: str, scored: pd.DataFrame, account: Sequence[str] = (), order: Sequence[str] = ()
+    title: str,
+    scored: pd.DataFrame,
+    account: Sequence[str] = (),
+    order: Sequence[str] = (),
+    notices: Sequence[str] = (),
 ) -> str:
     """The same for the page of a recording."""
     units, headings, rows = _content(scored, order)
@@ -139,7 +159,10 @@ def markdown(
     lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
     closing = [line for sentence in _closing(scored, account) for line in ("", sentence)]
-    return "\n".join([f"# {_title(title, scored)}", "", f"{units}.", "", *table, *lines, *closing])
+    first = [line for sentence in notices for line in (f"**{ATTENTION}:** {sentence}", "")]
+    return "\n".join(
+        [f"# {_title(title, scored)}", "", *first, f"{units}.", "", *table, *lines, *closing]
+    )
 
 
 def _closing(scored: pd.DataFrame, account: Sequence[str]) -> list[str]:

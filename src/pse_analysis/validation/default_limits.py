@@ -61,15 +61,17 @@ class DefaultLimits:
         below √3 p.u. even at an earth fault, and a voltage transformer saturates beyond its rated
         voltage factor, 1.9 at most (IEC 61869-3). A kV for a p.u. is above it from 3 kV on. [p.u.]
     power : float
-        Limit of |P| and |Q|, as a multiple of the reference power: the nominal power of the *whole*
-        grid (loads, generation, shunts and line charging added up without sign), or √3 V_n times
-        `NORMAL_KA` where that is more or no nominal power is known. The whole grid's, because any
-        single bus may get a plant many times its own nominal load, or a transit; the default of 10
-        leaves room for feed-in of ten times all loads at once, and for 40 kA at rated voltage.
+        Limit of |P| and |Q|, as a multiple of the reference power, √3 V_n times `NORMAL_KA`. It
+        does not look at the bus's own nominal load, because any bus may get a plant many times
+        its load, or a transit; the default of 10 stands for 40 kA at rated voltage, which no
+        conductor carries but in a short circuit, where the voltage is not there. Grid models that
+        put whole regions behind a bus of low voltage exceed that. So where the nominal load or
+        generation of any bus of the same rated voltage is above the reference power, the nominal
+        power of the whole grid (loads, plants, shunts and line charging added up without sign)
+        takes its place.
     current : float
-        Limit of |I|, as a multiple of the reference power's current at rated voltage, which is
-        `NORMAL_KA` at least. The default of 20 leaves room for 80 kA: currents, other than powers,
-        do reach the level of short circuits.
+        Limit of |I|, as a multiple of the reference power's current at rated voltage. The default
+        of 20 stands for 80 kA: currents, other than powers, do reach the level of short circuits.
     angle_turns : float
         Limit of the angles of voltages and currents, to both sides. Sources give −180 … 180 or
         0 … 360 degrees; the default of 2 turns leaves room for a vector group that was added
@@ -202,10 +204,16 @@ def physical_limits(
 def nominal_mva(network: Network) -> float:
     """Returns the nominal power of a grid: of all loads, plants, shunts and lines, without sign."""
     bus, branch = network.buses, network.branches
-    injected = np.hypot(np.abs(bus.p_load_mw) + np.abs(bus.p_gen_mw), bus.q_load_mvar).sum()
+    injected = _own_mva(network).sum()
     shunt = np.hypot(bus.g_shunt_pu, bus.b_shunt_pu).sum()
     charging = np.hypot(branch.g_pu, branch.b_pu)[branch.in_service].sum()
     return float(injected + network.base_mva * (shunt + charging))
+
+
+def _own_mva(network: Network) -> Array:
+    """Nominal apparent power of each bus, load and generation added without sign. (n_bus,)"""
+    bus = network.buses
+    return np.asarray(np.hypot(np.abs(bus.p_load_mw) + np.abs(bus.p_gen_mw), bus.q_load_mvar))
 
 
 def _of_grid(
@@ -216,10 +224,14 @@ def _of_grid(
     origin: npt.NDArray[np.object_],
 ) -> None:
     """Write the limits of powers and currents, in p.u., and what they follow from."""
-    total = nominal_mva(network)
     at = np.atleast_1d(metered_bus(network, layout.position, layout.side))
-    rated = np.sqrt(3.0) * network.buses.vn_kv[at] * NORMAL_KA
-    reference = np.maximum(total, rated)
+    total = nominal_mva(network)
+    rated = np.sqrt(3.0) * network.buses.vn_kv * NORMAL_KA
+    _, level = np.unique(network.buses.vn_kv, return_inverse=True)
+    largest = np.zeros(network.n_bus)
+    np.maximum.at(largest, level, _own_mva(network))
+    aggregated = (largest[level] > rated)[at]
+    reference = np.where(aggregated, np.maximum(total, rated[at]), rated[at])
     of_power = np.isin(layout.quantity, (P, Q))
     of_current = layout.quantity == IM
     span[of_power] = params.power * reference[of_power] / network.base_mva
@@ -228,7 +240,7 @@ def _of_grid(
     for rows, width in ((of_power, params.power), (of_current, params.current)):
         by_total = f"{width:g} × {total:.4g} MVA, the nominal power of the whole grid"
         by_rated = f"{width:g} × {NORMAL_KA:g} kA at rated voltage"
-        origin[rows] = np.where(total >= rated[rows], by_total, by_rated)
+        origin[rows] = np.where(aggregated[rows], by_total, by_rated)
 
 
 def _of_machine(

@@ -13,7 +13,7 @@ import pandas as pd
 from pse_analysis import vocabulary
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.measurement import Model
-from pse_analysis.validation import extrapolation
+from pse_analysis.validation import extrapolation, periods
 from pse_analysis.validation.block import RULED_OUT, Criteria, screen
 from pse_analysis.validation.criteria import decide
 from pse_analysis.validation.default_limits import PhysicalLimits, physical_limits
@@ -83,7 +83,9 @@ def validate(
     -----
     From ``history_end`` on, flags depend on samples up to their own only; but a stamp that has
     jumped ahead is known by the next one, well before the time it claims. One bad channel stops
-    nothing: where limits reject every sample of a channel, a warning is logged.
+    nothing: where limits reject every sample of a channel, or its samples come in another period
+    than is stated, a warning is logged. The stage goes on with the stated period: the spacing is
+    known only afterwards, and a mean's interval is no matter of its stamps.
     """
     params = ValidateParams() if params is None else params
     rules = resolve(channels, params, model)
@@ -126,6 +128,8 @@ def validate(
 
     default = physical_limits(channels, model, params.default_limits)
     _warn_of_limits(channels, rules, default, lane_channel[stamps.lane], value, reasons)
+    for sentence in periods.sentences(periods.wrong_periods(telemetry, channels)):
+        log.warning(sentence)
 
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
