@@ -96,6 +96,14 @@ def test_summary_names_every_method_and_the_bad_data(whole: Options) -> None:
         assert word in summary
 
 
+def test_summary_says_first_which_channels_have_no_threshold(whole: Options) -> None:
+    # Two hours of history hold eight quarter-hour means of 22 meters.
+    told = " ".join(load(whole).summary.split("wls")[0].split())
+    assert "attention: no threshold for changes was learnt for 22 of 50 channels" in told
+    assert "holds 7 usable samples" in told
+    assert "history_s to 27000 or more" in told
+
+
 def test_samples_are_never_deleted(whole: Options) -> None:
     tables = load(whole)
     key = list(KEYS["telemetry"])

@@ -121,3 +121,19 @@ def test_machine_is_reported_in_its_own_columns() -> None:
     assert line.split()[1:3] == ["35.4", "35.0"]
     assert "θ RMS" in table
     assert "|V|" not in table
+
+
+def test_notices_stand_between_title_and_table_and_findings_below_it(scored: pd.DataFrame) -> None:
+    notice, finding = "no threshold was learnt " * 8, "telemetry: 3 samples"
+    table = text("a case", scored, [finding], ["wls"], [notice, "second"])
+    lines = table.splitlines()
+    assert max(map(len, lines)) <= 100
+    places = [
+        table.index(t) for t in ("a case", "attention: no", "attention: second", "wls", "3 s")
+    ]
+    assert places == sorted(places)
+    page = markdown("a case", scored, [finding], ["wls"], [notice, "second"])
+    order = ("# a case", "**attention:** no", "**attention:** second", "| method", finding)
+    places = [page.index(t) for t in order]
+    assert places == sorted(places)
+    assert "attention" not in text("a case", scored, [finding]) + markdown("a case", scored)

@@ -143,17 +143,19 @@ def _beyond_default(
 ) -> Iterable[str]:
     """How many samples lie outside limits that nobody stated."""
     limit = validated.loc[(validated["reasons"] & int(Reason.LIMIT)) != 0]
-    count = limit.groupby("channel", observed=True)["value"].agg(["size", "first"])
-    beyond, told = 0, []
-    for at, rule in enumerate(rules):
-        if rule.channel in count.index and set(default.of(at)) & {rule.lower, rule.upper}:
-            size, first = count.loc[rule.channel]
-            beyond += int(size)
-            told.append(f"{rule.channel} ({size:,.0f}, e.g. {first:.4g}; {default.origin[at]})")
+    at = pd.Index([rule.channel for rule in rules]).get_indexer(pd.Index(limit["channel"]))
+    # What a sample was compared with tells whether that limit was a default one.
+    compared = limit["threshold"].to_numpy()
+    of_default = (compared == default.lower[at]) | (compared == default.upper[at])
+    count = limit[of_default].groupby(at[of_default])["value"].agg(["size", "first"])
+    told = [
+        f"{rules[k].channel} ({size:,}, e.g. {first:.4g}; {default.origin[k]})"
+        for k, size, first in count.itertuples()
+    ]
     if told:
         yield (
-            f"outside default limits, which no plant exceeds, lie {beyond:,} samples: "
-            f"{_named(told)}: look at their units, or state lower and upper"
+            f"samples outside the default limits, which no plant exceeds: {_named(told)}: look at "
+            "the unit, or state lower and upper"
         )
 
 
