@@ -59,16 +59,18 @@ class DefaultLimits:
     voltage_pu : float
         Upper limit of |V|; any magnitude above 0 is possible. Overvoltages of power frequency stay
         below √3 p.u. even at an earth fault, and a voltage transformer saturates beyond its rated
-        voltage factor, 1.9 at most (IEC 61869-3). A kV for a p.u. is above it from 3 kV on. [p.u.]
+        voltage factor, 1.9 at most (IEC 61869-3). A kV for a p.u. is above it in grids of more than
+        2 kV; the 0.4 kV of a low-voltage grid look like 0.4 p.u. [p.u.]
     power : float
         Limit of |P| and |Q|, as a multiple of the reference power, √3 V_n times `NORMAL_KA`. It
         does not look at the bus's own nominal load, because any bus may get a plant many times
         its load, or a transit; the default of 10 stands for 40 kA at rated voltage, which no
-        conductor carries but in a short circuit, where the voltage is not there. Grid models that
-        put whole regions behind a bus of low voltage exceed that. So where the nominal load or
-        generation of any bus of the same rated voltage is above the reference power, the nominal
-        power of the whole grid (loads, plants, shunts and line charging added up without sign)
-        takes its place.
+        conductor carries but in a short circuit, where the voltage is not there. At 20 kV that is
+        1386 MW, so W for MW are out from 1.4 kW on. Ratings of branches would be sharper, but a
+        `Network` knows none. Grid models that put whole regions behind a bus of low voltage exceed
+        that: where the nominal load or generation of any bus of the same rated voltage is above
+        the reference power, the nominal power of the whole grid (loads, plants, shunts and line
+        charging added up without sign) takes its place.
     current : float
         Limit of |I|, as a multiple of the reference power's current at rated voltage. The default
         of 20 stands for 80 kA: currents, other than powers, do reach the level of short circuits.
