@@ -137,7 +137,7 @@ def test_missing_or_broken_profiles_say_what_to_do(tmp_path: Path):
         profiles.load(tmp_path)
     (tmp_path / profiles.FILE).write_bytes(b"PAR1 cut short")
     with pytest.raises(
-        TableError, match="not a whole parquet file.*restore it from the repository"
+        TableError, match=r"not a whole parquet file.*restore it from the repository"
     ):
         profiles.load(tmp_path)
     frame = pd.read_parquet(FOLDER / profiles.FILE)
