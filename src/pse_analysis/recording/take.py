@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +13,9 @@ import pandas as pd
 import rerun as rr
 import rerun.blueprint as rrb
 
+from pse_analysis.errors import ParameterError
 from pse_analysis.recording.views import Window
+from pse_analysis.recording.whole import CountedStream, write_whole
 
 if TYPE_CHECKING:
     from pse_analysis.parameters import Study
@@ -59,15 +62,34 @@ class Take:
 
     @contextmanager
     def open(self, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-        """A stream into the file, on which the viewer opens with the given blueprint."""
-        stream = rr.RecordingStream(APPLICATION, recording_id=f"{APPLICATION}-{self.case}")
-        stream.save(self.path, default_blueprint=blueprint)
+        """A stream of what the file is to hold, on which the viewer opens with the blueprint.
+
+        The file is written when the block ends, and read back. If the block fails, no file is
+        written.
+
+        Raises
+        ------
+        StorageError
+            If the file does not hold every byte, or not every row that was sent.
+        ParameterError
+            If the environment turned Rerun off.
+        """
+        stream = CountedStream(APPLICATION, recording_id=f"{APPLICATION}-{self.case}")
+        if not rr.is_enabled(stream):
+            raise ParameterError(
+                f"the variable RERUN={os.environ.get('RERUN')} turns recordings off: unset it and "
+                "run again"
+            )
+        # Rerun only logs what goes wrong while it writes a file, so it records to memory.
+        memory = stream.memory_recording()
         try:
+            stream.send_blueprint(blueprint, make_active=False, make_default=True)
             stream.send_recording_name(self.case)
             yield stream
+            content = memory.drain_as_bytes()
         finally:
-            stream.flush()
             stream.disconnect()
+        write_whole(Path(self.path), content, stream.rows)
 
 
 def coded(table: pd.DataFrame, *columns: str) -> pd.DataFrame:
