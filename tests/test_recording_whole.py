@@ -104,9 +104,7 @@ def test_error_of_the_disk_says_what_to_do_and_leaves_no_file(
 
 
 def test_folder_that_is_not_there_is_named(content: bytes, tmp_path: Path) -> None:
-    with pytest.raises(
-        StorageError, match=r"no/demo\.rrd of .* could not be written whole: No"
-    ):
+    with pytest.raises(StorageError, match=r"no/demo\.rrd of .* could not be written whole: No"):
         write_whole(tmp_path / "no" / "demo.rrd", content, SENT)
 
 
