@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from study_tables import VM_BUSES, StudyTables, study_tables
 
 from pse_analysis import drawing, recording
 from pse_analysis.grid import library
+from pse_analysis.pipeline import viewer
 from pse_analysis.recording import Take
 
 
@@ -74,11 +74,13 @@ STAGES = ("validate", "align", "estimate", "score")
 
 @pytest.mark.parametrize("kind", ["simulated", "real"])
 def test_recordings_pass_the_verification_of_rerun(folder, kind):
-    rerun = Path(sys.executable).with_name("rerun")
-    command = str(rerun) if rerun.exists() else shutil.which("rerun")
-    assert command
     paths = [str(folder / kind / f"{stage}.rrd") for stage in STAGES]
-    done = subprocess.run([command, "rrd", "verify", *paths], capture_output=True, text=True)
+    done = subprocess.run(
+        [viewer.find(), "rrd", "verify", *paths],
+        capture_output=True,
+        text=True,
+        env=viewer.quiet(os.environ),
+    )
     assert done.returncode == 0, done.stderr
     assert "without error" in done.stdout + done.stderr
 

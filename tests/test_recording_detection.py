@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
@@ -13,6 +12,7 @@ from rerun.chunk import RrdReader
 from study_tables import StudyTables, study_tables
 
 from pse_analysis import recording
+from pse_analysis.pipeline import viewer
 from pse_analysis.recording import Take
 from pse_analysis.recording.detection import N_BIN, _by_size
 from pse_analysis.vocabulary import Flag
@@ -43,15 +43,14 @@ def record(tables: StudyTables, path: Path, *, known: bool) -> set[str]:
 def test_recording_passes_the_verification_of_rerun(
     tables: StudyTables, tmp_path: Path, known: bool
 ) -> None:
-    rerun = Path(sys.executable).with_name("rerun")
-    command = str(rerun) if rerun.exists() else shutil.which("rerun")
-    if command is None:
-        pytest.skip("no rerun viewer")
     record(tables, tmp_path / "score.rrd", known=known)
     done = subprocess.run(
-        [command, "rrd", "verify", str(tmp_path / "score.rrd")],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [viewer.find(), "rrd", "verify", str(tmp_path / "score.rrd")],
+        capture_output=True,
+        text=True,
+        env=viewer.quiet(os.environ),
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -309,7 +309,7 @@ class TestCommandLine:
             runner, "run", lambda n, o, r: RUN(n, o, r, work={**WORK, "validate": record})
         )
         started: list[list[str]] = []
-        monkeypatch.setattr("os.execv", lambda _, command: started.append(command))
+        monkeypatch.setattr("os.execve", lambda _, command, __: started.append(command))
         monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
         assert cli.main(self.arguments(options, "small", "--force")) == 0
         cli.main(["view", *self.arguments(options, "small")[1:]])

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from pse_analysis.errors import ParameterError, PseError, TableError
 from pse_analysis.files import check
-from pse_analysis.pipeline import runner
+from pse_analysis.pipeline import runner, viewer
 from pse_analysis.pipeline.case import Case, list_cases, load_case, project_root
 from pse_analysis.pipeline.plan import NAMES, THREADS, Options, Reporter, Result, again
 from pse_analysis.pipeline.results import stored
@@ -337,15 +336,7 @@ def _view(options: argparse.Namespace) -> int:
     for path in result.recordings:
         facts = next(e.files[path.name] for e in shown.values() if e.folder == path.parent)
         check(path, facts, again(case.name))
-    beside = Path(sys.executable).with_name("rerun")
-    viewer = str(beside) if beside.is_file() else shutil.which("rerun")
-    if viewer is None:
-        raise ParameterError(
-            f"no Rerun viewer: expected {beside} or rerun on the PATH; install rerun-sdk"
-        )
-    # The viewer would listen on every interface unless told otherwise.
-    command = [viewer, *map(str, result.recordings), "--bind", "127.0.0.1"]
-    os.execv(viewer, command)
+    viewer.start(result.recordings)
 
 
 def _verify(options: argparse.Namespace) -> int:
