@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
+
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from simulated_case import feeder
 
@@ -160,11 +163,146 @@ def test_what_was_taken_in_can_be_written_and_read(tmp_path):
         (frame(time_utc=[pd.NaT] + [T] * 5), "time_utc is empty in 1 rows"),
         (frame(channel=["U7"] * 6), "channel 'U7' is not in the channels table .*mean 'U6'"),
         (frame(quality=["good"] * 6), "'quality' must hold whole numbers"),
+        (frame(trial=[0, None, 0, 0, 0, 0]), "trial is empty in 1 rows, first row 1; number every"),
+        (frame(trial=np.inf), "'trial' must hold whole numbers"),
+        (frame(trial=1j), "'trial' must hold whole numbers, received complex128"),
+        (frame(value=frame().time_utc), "must be numeric, received datetime64"),
+        (frame(value=pd.Series([10**400] * 6, dtype=object)), "must be numeric, received object"),
+        (frame(channel=[["U6"]] * 6), r"'channel' must hold names, received e.g. \['U6'\]"),
+        (frame(channel=["U6\udcff"] * 6), r"bytes that are no text: .*encoding='cp1252'"),
+        (frame().set_index("time_utc"), r"'time_utc' is missing.*pass frame.reset_index\(\)"),
+        (frame().T.T.set_axis([["a"] * 3, [1, 2, 3]], axis=1), "column names have 2 levels"),
+        (frame().to_dict("list"), "telemetry: expected a pandas DataFrame, received dict"),
+        (
+            pd.concat([frame(), frame()[["value"]]], axis=1),
+            "telemetry: 'value' is the name of two columns; expected one: rename or drop the other",
+        ),
     ],
 )
 def test_a_broken_table_is_refused_with_its_remedy(own, message):
     with pytest.raises(TableError, match=message):
         ingest(own, channels(), feeder())
+
+
+# 2016-06-09T08:00:00Z and the minute after it, as other systems count.
+EPOCH_S = np.array([1465459200, 1465459260] * 3)
+
+
+@pytest.mark.parametrize(
+    ("times", "advice"),
+    [
+        (EPOCH_S, "pandas.to_datetime(frame.time_utc, unit='s', utc=True)"),
+        (EPOCH_S * 10**3, "pandas.to_datetime(frame.time_utc, unit='ms', utc=True)"),
+        (EPOCH_S * 10**6, "pandas.to_datetime(frame.time_utc, unit='us', utc=True)"),
+        (EPOCH_S * 10**9, "pandas.to_datetime(frame.time_utc, unit='ns', utc=True)"),
+        (EPOCH_S + 0.25, "pandas.to_datetime(frame.time_utc, unit='s', utc=True)"),
+        (
+            [str(t) for t in EPOCH_S * 1000],
+            "pandas.to_datetime(pandas.to_numeric(frame.time_utc), unit='ms', utc=True)",
+        ),
+        ([42530.333, 42530.334] * 3, "unit='D', origin='1899-12-30'), with timezone= here"),
+        ([736490.3, 736490.4] * 3, "are no s, ms, us or ns since 1970"),
+        (["2016-06-09 08:00"] * 6, "pandas.to_datetime(frame.time_utc, utc=True), or without utc"),
+        (pd.period_range("2016-06-09", periods=6, freq="h"), "frame.time_utc.dt.to_timestamp()"),
+    ],
+)
+def test_the_advice_on_times_fits_the_numbers_that_came(times, advice):
+    own = frame(time_utc=times)
+    with pytest.raises(TableError) as refused:
+        ingest(own, channels(), feeder())
+    assert advice in str(refused.value)
+    if "utc=True), or" in advice or "=True)" not in advice:
+        return
+    followed = eval(advice, {"pandas": pd, "frame": own})  # our own advice, word for word
+    assert abs(followed.iloc[0] - T) <= pd.Timedelta("1s")
+    assert ingest(own.assign(time_utc=followed), channels(), feeder()).telemetry.time_utc.min() >= T
+
+
+def test_times_of_a_wrong_unit_are_named(caplog):
+    ingest(frame(time_utc=pd.to_datetime(EPOCH_S, utc=True)), channels(), feeder())
+    assert "6 of 6 times in time_utc lie outside 1980 … 2200, e.g. 1970-01-01" in caplog.text
+
+
+@pytest.mark.parametrize("column", ["channel", "time_utc", "value", "trial", "quality"])
+def test_categories_stand_for_their_values(column: str):
+    own = frame(trial=[0, 1, 0, 1, 0, 1], quality=[192, None, 0, 0, 0, 0])
+    coded = own.assign(**{column: own[column].astype("category")})
+    pd.testing.assert_frame_equal(
+        ingest(coded, channels(), feeder()).telemetry, ingest(own, channels(), feeder()).telemetry
+    )
+
+
+def test_all_storages_of_the_same_values_are_taken_alike():
+    expected = ingest(frame(value=[12.5, 12.25, 60.0, 80.0, 120.0, 125.0]), channels(), feeder())
+    whole = pd.Series([12.5, 12.25, 60.0, 80.0, 120.0, 125.0])
+    for value in (
+        whole.astype("float32"),
+        whole.astype("Float64"),
+        whole.astype("double[pyarrow]"),
+        whole.astype(pd.SparseDtype("float64", np.nan)),
+        whole.map(Decimal),
+        whole.astype(object),
+        whole.astype("complex128"),
+    ):
+        raw = ingest(frame(value=value), channels(), feeder())
+        pd.testing.assert_frame_equal(raw.telemetry, expected.telemetry)
+    stored = frame(value=whole).astype(
+        {"channel": "string[pyarrow]", "time_utc": pd.ArrowDtype(pa.timestamp("ms", "UTC"))}
+    )
+    pd.testing.assert_frame_equal(
+        ingest(stored, channels(), feeder()).telemetry, expected.telemetry
+    )
+
+
+def test_an_index_of_any_kind_says_nothing():
+    expected = ingest(frame(), channels(), feeder()).telemetry
+    for index in ([7] * 6, pd.MultiIndex.from_product([[1, 2], list("abc")]), list("fedcba")):
+        own = frame().set_axis(index, axis=0)
+        pd.testing.assert_frame_equal(ingest(own, channels(), feeder()).telemetry, expected)
+
+
+def test_values_beyond_all_numbers_are_kept_for_validation():
+    raw = ingest(frame(value=[12.66, 12.5, 1e300, -1e300, 1e308, 125.0]), channels(), feeder())
+    assert raw.telemetry.value.abs().max() == pytest.approx(1e305)
+
+
+# The bus is rated 12.66 kV.
+@pytest.mark.parametrize(
+    ("unit", "value", "remedy"),
+    [
+        ("pu", 12.66, "look like kV: write unit = 'kv'"),
+        ("pu", 12500.0, "look like V: divide values, sigma and limits by 1000"),
+        ("pu", 98.0, "look like per cent: divide values, sigma and limits by 100"),
+        ("pu", 7.31, "look like kV from phase to ground: multiply values, sigma and limits by √3"),
+        ("kv", 1.02, "look like p.u.: write unit = 'pu'"),
+        ("kv", 12660.0, "look like V: divide values"),
+    ],
+)
+def test_voltages_of_another_unit_are_refused_with_the_unit_to_write(unit, value, remedy):
+    about = channels().assign(unit=[unit, "kW", "A"], lower=np.nan, upper=np.nan)
+    own = frame(value=[value, value, 60.0, 80.0, 120.0, 125.0])
+    with pytest.raises(TableError) as refused:
+        ingest(own, about, feeder())
+    assert remedy in str(refused.value)
+    assert "rated 12.66 kV" in str(refused.value)
+    ingest(own, about, feeder(), units="accept")
+
+
+def test_one_broken_voltage_meter_is_named_and_stops_nothing(caplog):
+    ingest(frame(value=[400.0, 410.0, 60.0, 80.0, 120.0, 125.0]), channels(), feeder())
+    assert "'U6' has a median of 405 kv = 31.99 p.u. at bus/6" in caplog.text
+
+
+def test_flows_that_dwarf_the_grid_are_named(caplog):
+    about = channels().assign(unit=["kV", "MW", "kA"], lower=np.nan, upper=np.nan)
+    ingest(frame(value=[12.66, 12.5, 600.0, 800.0, 120.0, 125.0]), about, feeder())
+    assert "if these values are in kw, write unit = 'kw'" in caplog.text
+    assert "if these values are in a, write unit = 'a'" in caplog.text
+
+
+def test_a_choice_that_does_not_exist_is_refused():
+    with pytest.raises(TableError, match="shunts must be 'refuse' or 'accept', received 'ignore'"):
+        ingest(frame(), channels(), feeder(), shunts="ignore")
 
 
 def test_an_hour_that_occurs_twice_needs_utc():
@@ -205,6 +343,9 @@ def test_blank_cells_of_a_csv_file_take_their_defaults(tmp_path):
         (("unit", "MW"), "does not fit vm_pu"),
         (("sigma", -1.0), "must be a finite standard deviation above 0, received -1.0"),
         (("sign", 257), "sign of 'U6' must be 1, or -1 .*; received 257"),
+        (("sigma", 1e-13), "sigma of 'U6' is 1e-13, expected 1e-12 … 1e.12"),
+        (("period_s", np.inf), "'period_s' of channel 'U6': expected 1e-06 … 1e.09 seconds"),
+        (("channel", "U\udcff6"), "bytes that are no text"),
         (("sign", 1.5), "sign of 'U6' must be 1, or -1 .*; received 1.5"),
     ],
 )
@@ -214,6 +355,21 @@ def test_broken_channels_are_refused(cell, message):
     broken.loc[0, cell[0]] = cell[1]
     with pytest.raises(TableError, match=message):
         ingest(frame(), broken, feeder())
+
+
+@pytest.mark.parametrize("sigma", [200.0, 2.0, 1.01])
+def test_a_relative_sigma_is_a_fraction(sigma: float):
+    per_cent = channels().assign(sigma=[0.05, sigma, 1.0])
+    with pytest.raises(TableError, match=r"sigma of 'PV6' is relative.*at most 1, received"):
+        ingest(frame(), per_cent, feeder())
+
+
+def test_columns_of_channels_stand_once_and_may_be_categories():
+    expected = ingest(frame(), channels(), feeder()).channels
+    coded = channels().astype("category")
+    pd.testing.assert_frame_equal(ingest(frame(), coded, feeder()).channels, expected)
+    with pytest.raises(TableError, match="channels: 'sigma' is the name of two columns"):
+        ingest(frame(), pd.concat([channels(), channels()[["sigma"]]], axis=1), feeder())
 
 
 def test_bus_results_of_another_tool_with_their_shunts_are_refused():

@@ -14,12 +14,14 @@ from pse_analysis.telemetry.tables import (
     read_telemetry,
     write_raw,
 )
+from pse_analysis.telemetry.units import check_units
 
 __all__ = [
     "RawCase",
     "accept",
     "check_channels",
     "check_shunts",
+    "check_units",
     "ingest",
     "read_model",
     "read_provenance",

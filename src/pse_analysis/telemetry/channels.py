@@ -14,9 +14,21 @@ from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import INPUT, STATES, Machine
 from pse_analysis.measurement import Model
-from pse_analysis.vocabulary import UNITS, Quantity, check, shown
+from pse_analysis.vocabulary import (
+    UNITS,
+    Quantity,
+    SigmaKind,
+    check,
+    plain_columns,
+    schema,
+    shown,
+    unwritable,
+)
 
 FloatArray = npt.NDArray[np.float64]
+
+SIGMA = (1e-12, 1e12)
+"""Standard deviations that leave a weight 1/σ² which numbers can hold, in any unit."""
 
 _VOLTAGES = (Quantity.VM_PU, Quantity.VA_DEGREE)
 _OF_MACHINE = (INPUT, *STATES)
@@ -30,16 +42,15 @@ def check_channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     TableError
         On the first channel that does not fit, with what was expected.
     """
-    if "sigma" in channels.columns and "channel" in channels.columns:
-        sigma = pd.to_numeric(channels["sigma"], errors="coerce")
-        bad = ~((sigma > 0) & np.isfinite(sigma)).to_numpy()
-        if bad.any():
-            row = channels.loc[bad].iloc[0]
-            raise TableError(
-                f"channels: sigma of {row['channel']!r} must be a finite standard deviation above "
-                f"0, received {shown(row['sigma'])}; take it from the sensor's accuracy class"
-            )
+    channels = plain_columns("channels", channels, list(schema("channels").columns))
+    _check_sigma(channels)
     checked = check("channels", channels)
+    damaged = unwritable([*checked["channel"], *checked["element"]])
+    if damaged:
+        raise TableError(
+            f"channels: {damaged[0]!r} holds bytes that are no text: read the source with its own "
+            "encoding, e.g. encoding='cp1252'"
+        )
     crossed = checked["lower"] > checked["upper"]
     if crossed.any():
         row = checked.loc[crossed].iloc[0]
@@ -87,6 +98,39 @@ def check_channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
                 "the unit"
             )
     return checked
+
+
+def _check_sigma(channels: pd.DataFrame) -> None:
+    """Refuse a standard deviation that no sensor has; whether there is one says the schema."""
+    if "sigma" not in channels.columns or "channel" not in channels.columns:
+        return
+    with np.errstate(all="ignore"):
+        sigma = pd.to_numeric(channels["sigma"], errors="coerce").to_numpy(dtype=np.float64)
+    bad = ~((sigma > 0) & np.isfinite(sigma))
+    if bad.any():
+        row = channels.loc[bad].iloc[0]
+        raise TableError(
+            f"channels: sigma of {row['channel']!r} must be a finite standard deviation above "
+            f"0, received {shown(row['sigma'])}; take it from the sensor's accuracy class"
+        )
+    bad = ~((sigma >= SIGMA[0]) & (sigma <= SIGMA[1]))
+    if bad.any():
+        row = channels.loc[bad].iloc[0]
+        raise TableError(
+            f"channels: sigma of {row['channel']!r} is {shown(row['sigma'])}, expected "
+            f"{SIGMA[0]:g} … {SIGMA[1]:g}: its square is the weight of a measurement; take it from "
+            "the sensor's accuracy class"
+        )
+    if "sigma_kind" not in channels.columns:
+        return
+    bad = (channels["sigma_kind"] == SigmaKind.RELATIVE).to_numpy(dtype=bool) & (sigma > 1.0)
+    if bad.any():
+        row = channels.loc[bad].iloc[0]
+        raise TableError(
+            f"channels: sigma of {row['channel']!r} is relative, a fraction of the magnitude: "
+            f"expected at most 1, received {shown(row['sigma'])}; divide per cent by 100 (1 % is "
+            "0.01), or write sigma_kind = 'absolute' if it is in the channel's unit"
+        )
 
 
 def suggest(name: str, names: Iterable[str]) -> str:
@@ -163,9 +207,11 @@ def check_shunts(telemetry: pd.DataFrame, channels: pd.DataFrame, network: Netwo
         share = (0.0, 1.5)
         power = by_quantity.get(Quantity.P_MW)
         if power is not None and len(power) and buses.p_load_mw[i] > 0:
-            measured = max(float(-np.median(power) / buses.p_load_mw[i]), 0.0)
+            with np.errstate(over="ignore"):
+                measured = max(float(-np.median(power) / buses.p_load_mw[i]), 0.0)
             share = (0.8 * measured, 1.25 * measured)
-        square = float(np.median(voltage)) ** 2 * network.base_mva
+        with np.errstate(over="ignore"):  # no load is near a shunt of infinite power
+            square = np.square(np.median(voltage)) * network.base_mva
         for quantity, nominal, shares, shunt, unit in (
             (Quantity.P_MW, -buses.p_load_mw[i], (0, 1.5), -buses.g_shunt_pu[i] * square, "MW"),
             (Quantity.Q_MVAR, -buses.q_load_mvar[i], share, buses.b_shunt_pu[i] * square, "Mvar"),

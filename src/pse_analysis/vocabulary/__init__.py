@@ -26,6 +26,7 @@ NIS, NEES       normalised squared innovation ηᵀS⁻¹η and state error eᵀ
 
 from __future__ import annotations
 
+from pse_analysis.vocabulary.columns import plain_columns, plain_values, unwritable
 from pse_analysis.vocabulary.schemas import KEYS, check, schema, shown
 from pse_analysis.vocabulary.terms import (
     SEVERITY,
@@ -60,9 +61,12 @@ __all__ = [
     "Source",
     "Status",
     "check",
+    "plain_columns",
     "plain_unit",
+    "plain_values",
     "schema",
     "severity",
     "shown",
+    "unwritable",
     "usable",
 ]

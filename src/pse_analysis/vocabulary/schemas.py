@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pse_analysis.errors import TableError
+from pse_analysis.vocabulary.columns import plain_columns
 from pse_analysis.vocabulary.terms import (
     Aggregation,
     FaultKind,
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import pandera.errors
     import pandera.pandas as pa
+
+PERIOD_S = (1e-6, 1e9)
+"""Shortest and longest sampling period: stamps count microseconds, and 64 bits of them. [s]"""
 
 KEYS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -79,6 +83,8 @@ def schema(table: str) -> pa.DataFrameSchema:
         return pa.Check.isin(names, error=f"one of {', '.join(map(repr, names))}")
 
     above_0, not_below_0 = pa.Check.gt(0, error="above 0"), pa.Check.ge(0, error="0 or above")
+    low, high = PERIOD_S
+    seconds = pa.Check.in_range(low, high, error=f"{low:g} … {high:g} seconds")
     element = pa.Check.str_matches(
         r"^(bus|branch|machine)/.+", error="bus/NAME, branch/NAME or machine/NAME"
     )
@@ -110,7 +116,7 @@ def schema(table: str) -> pa.DataFrameSchema:
             "sigma_kind": text(one_of(SigmaKind)),
             "lower": col("float64", nullable=True),
             "upper": col("float64", nullable=True),
-            "period_s": col("float64", above_0),
+            "period_s": col("float64", above_0, seconds),
             "sign": col("int8", pa.Check.isin([-1, 1], error="1 or -1")),
             "aggregation": text(one_of(Aggregation)),
         },
@@ -204,22 +210,23 @@ def check(table: str, frame: pd.DataFrame) -> pd.DataFrame:
     import pandera.errors
 
     expected = schema(table)
-    missing = [name for name in expected.columns if name not in frame.columns]
+    columns = list(expected.columns)
+    frame = plain_columns(table, frame, columns)
+    missing = [name for name in columns if name not in frame.columns]
     if missing:
         raise TableError(
             f"{table}: column {missing[0]!r} is missing; expected columns "
-            f"{', '.join(expected.columns)}; received {', '.join(map(str, frame.columns))}"
+            f"{', '.join(columns)}; received {', '.join(map(str, frame.columns))}"
         )
     try:
-        checked = expected.validate(frame[list(expected.columns)], lazy=False)
+        checked = expected.validate(frame[columns], lazy=False)
     except pandera.errors.SchemaError as error:
         raise TableError(_broken(table, frame, error)) from error
     if table != "faults":
-        repeated = checked.duplicated(list(KEYS[table]))
+        repeated = checked.duplicated(list(KEYS[table])).to_numpy()
         if repeated.any():
-            row = ", ".join(
-                f"{key} {shown(checked.loc[repeated, key].iloc[0])}" for key in KEYS[table]
-            )
+            first = checked.iloc[int(np.argmax(repeated))]
+            row = ", ".join(f"{key} {shown(first[key])}" for key in KEYS[table])
             raise TableError(
                 f"{table}: {int(repeated.sum())} rows repeat the key of another, the first has "
                 f"{row}; expected one row each: leave one out, or give it a key of its own"
@@ -243,14 +250,26 @@ def _broken(table: str, frame: pd.DataFrame, error: pandera.errors.SchemaError) 
     elif getattr(error.check, "error", None) == "text":
         wanted, bad = "text", ~series.map(lambda value: isinstance(value, str))
     elif getattr(error.check, "error", None):
-        wanted, bad = error.check.error, series.index.isin(error.failure_cases["index"])
+        wanted, bad = error.check.error, _failing(table, series)
     else:
         kind = schema(table).columns[column].dtype
         first = f", e.g. {shown(series.iloc[0])}" if len(series) else ""
         return f"{where}: expected type {kind}, received {series.dtype}{first}; convert the column"
-    row = int(np.argmax(np.asarray(bad)))
+    row = int(np.argmax(np.asarray(bad, dtype=bool)))
     keys = [f"{key} {shown(frame[key].iloc[row])}" for key in KEYS[table] if key != column]
     return (
         f"{where}{' of ' if keys else ''}{', '.join(keys)}: expected {wanted}, received "
         f"{shown(series.iloc[row])}; mend that row, or leave it out"
     )
+
+
+def _failing(table: str, series: pd.Series) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Rows that break the schema of their column, by position: an index may repeat its labels."""
+    import pandera.errors
+
+    plain = series.reset_index(drop=True)
+    try:
+        schema(table).columns[str(series.name)].validate(plain.to_frame(), lazy=False)
+    except pandera.errors.SchemaError as error:
+        return np.asarray(plain.index.isin(error.failure_cases["index"]))
+    return np.ones(len(series), dtype=bool)
