@@ -12,8 +12,10 @@ Conventions:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +24,7 @@ import pandas as pd
 from scipy import linalg
 
 from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.vocabulary import as_number, plain_columns, shown, unwritable
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,6 +32,11 @@ ELEMENT = "machine"
 """Kind of element in tables: channels and states stand at ``machine/NAME``."""
 STATES = ("rotor_angle_rad", "rotor_speed_rad_s")
 INPUT = "delta_m_pu"
+PLATE: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {"s_mva": (1e-6, 1e6), "t_j_s": (1e-3, 1e4), "f_hz": (1.0, 1e4)}
+)
+"""What a nameplate may say, from a toy to far above the largest. [MVA, s, Hz]"""
+LARGEST_DAMPING_PU = 1e4
 
 
 @dataclass(frozen=True)
@@ -65,14 +73,22 @@ class Machine:
     name: str = "1"
 
     def __post_init__(self) -> None:
-        for key in ("s_mva", "t_j_s", "f_hz"):
-            if not getattr(self, key) > 0:
+        for key, (low, high) in PLATE.items():
+            value = getattr(self, key)
+            if not (value > 0 and low <= value <= high):
                 raise ParameterError(
-                    f"[machine] {key} must be above 0, received {getattr(self, key)!r}; it stands "
-                    "on the nameplate (T_j = 2H)"
+                    f"[machine] {key} must be above 0, {low:g} … {high:g}, received {value!r}; it "
+                    "stands on the nameplate (T_j = 2H)"
                 )
-        if not np.isfinite(self.k_d_pu):
-            raise ParameterError(f"[machine] k_d_pu must be a number, received {self.k_d_pu!r}")
+        if not abs(self.k_d_pu) <= LARGEST_DAMPING_PU:
+            raise ParameterError(
+                f"[machine] k_d_pu must be a number, at most {LARGEST_DAMPING_PU:g} in size, "
+                f"received {self.k_d_pu!r}: torque per unit of speed deviation, both per unit"
+            )
+        if not self.name or unwritable([self.name]):
+            raise ParameterError(
+                f"[machine] name must be a text of printable characters, received {self.name!r}"
+            )
 
     @property
     def omega0(self) -> float:
@@ -119,9 +135,12 @@ class Machine:
         Raises
         ------
         TableError
-            If a column is missing or there is not exactly one row.
+            If a column is missing, a value is no number, or there is not exactly one row.
+        ParameterError
+            If a number cannot stand on a nameplate.
         """
         names = ("name", "s_mva", "u_kv", "f_hz", "t_j_s", "k_d_pu")
+        table = plain_columns("machine", table, names)
         missing = [n for n in names if n not in table.columns]
         if missing or len(table) != 1:
             raise TableError(
@@ -129,7 +148,15 @@ class Machine:
                 f"{len(table)} rows with {', '.join(map(str, table.columns))}"
             )
         row = table.iloc[0]
-        return cls(name=str(row["name"]), **{n: float(row[n]) for n in names[1:]})
+        numbers = {}
+        for name in names[1:]:
+            try:
+                numbers[name] = as_number(row[name])
+            except (TypeError, ValueError, OverflowError) as error:
+                raise TableError(
+                    f"machine: {name} must be a number, received {shown(row[name])}"
+                ) from error
+        return cls(name=str(row["name"]), **numbers)
 
 
 @dataclass(frozen=True)
@@ -202,7 +229,7 @@ def sample(machine: Machine, densities: Densities, step_s: float) -> Sampled:
     Raises
     ------
     ParameterError
-        If the step is not above 0.
+        If the step is not above 0, or so long that the machine has left the range of numbers.
 
     Notes
     -----
@@ -215,6 +242,20 @@ def sample(machine: Machine, densities: Densities, step_s: float) -> Sampled:
         raise ParameterError(
             f"the step must be above 0 s, received {step_s}: order the samples by time"
         )
+    with np.errstate(all="ignore"):
+        out = _sampled(machine, densities, step_s)
+    if not all(np.isfinite(array).all() for array in out):
+        raise ParameterError(
+            f"a step of {step_s:g} s is {abs(machine.k_d_pu) / machine.t_j_s * step_s:.3g} times "
+            "T_j/K_d, over which the machine leaves the range of numbers: sample it more often, or "
+            "check t_j_s, k_d_pu and the densities"
+        )
+    for array in out:
+        array.setflags(write=False)
+    return out
+
+
+def _sampled(machine: Machine, densities: Densities, step_s: float) -> Sampled:
     A, B, n, h = machine.A, machine.B, 2, step_s
     block = np.zeros((2 * n, 2 * n))
     block[:n, :n], block[:n, n:], block[n:, n:] = -A, densities.Q, A.T
@@ -226,7 +267,4 @@ def sample(machine: Machine, densities: Densities, step_s: float) -> Sampled:
     chain[:n, :n], chain[:n, n : n + 1], chain[n, n + 1] = A, B, 1.0
     integrals = linalg.expm(chain * h)
     hold, ramp = integrals[:n, n : n + 1], integrals[:n, n + 1 :] / h
-    out = Sampled(F, hold - ramp, ramp, 0.5 * (Q + Q.T), densities.R / h)
-    for array in out:
-        array.setflags(write=False)
-    return out
+    return Sampled(F, hold - ramp, ramp, 0.5 * (Q + Q.T), densities.R / h)

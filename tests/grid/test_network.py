@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pandas as pd
 import pytest
 from reference import GRIDS
 
@@ -166,11 +167,53 @@ def spoilt(column: str, value: object, n: int = 14) -> np.ndarray:
         ("branches", {"to_bus": np.arange(20) % 14, "from_bus": [0] * 20}, "ends at the bus where"),
         ("buses", {"q_max_mvar": np.full(14, np.nan)}, "q_max_mvar of bus '1'.*inf where"),
         ("buses", {"name": ("1",) * 14}, "distinct names, '1' repeats"),
+        ("buses", {"vn_kv": spoilt("vn_kv", 12660.0)}, "vn_kv of bus '4'.*in V, divide it by 1000"),
+        ("buses", {"vn_kv": spoilt("vn_kv", 1e-300)}, "vn_kv of bus '4' must be 0.001 … 1500 kV"),
+        ("buses", {"p_load_mw": spoilt("p_load_mw", 1e300)}, "p_load_mw of bus '4'.*at most 1e.12"),
+        ("buses", {"vm_set_pu": np.full(14, 110.0)}, "vm_set_pu of bus '1'.*kV, divide it by vn_k"),
+        ("branches", {"shift_rad": np.full(20, 30.0)}, "shift_rad of branch '1-2'.*by π/180"),
+        (
+            "branches",
+            {"tap": np.full(20, 230.0)},
+            "tap of branch '1-2'.*over the rated ratio",
+        ),
+        ("branches", {"r_pu": [1e-14] * 20, "x_pu": [1e-14] * 20}, "'1-2' has zero impedance"),
+        ("branches", {"from_bus": np.full(20, np.nan)}, "from_bus of branch '1-2'.*received nan"),
+        ("branches", {"from_bus": np.full(20, 0.5)}, "from_bus of branch '1-2'.*received 0.5"),
+        ("branches", {"x_pu": [10**400] * 20}, "x_pu of branch '1-2' must be a number"),
+        ("branches", {"x_pu": [1j] * 20}, "x_pu of branch '1-2' must be a number; received 1j"),
     ],
 )
 def test_impossible_grid_is_refused(table: str, columns: dict[str, object], expected: str) -> None:
     with pytest.raises(GridError, match=expected):
         changed(library.load("ieee14"), table, **columns)
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "expected"),
+    [
+        ("buses", lambda f: pd.concat([f, f[["kind"]]], axis=1), "'kind' is the name of two col"),
+        ("buses", lambda f: f.assign(name=[None, *f.name[1:]]), "'buses': name is empty in row 0"),
+        ("buses", lambda f: f.assign(name=["", *f.name[1:]]), "'buses': '' is no name"),
+        ("buses", lambda f: f.assign(name=["a\x1b[2J", *f.name[1:]]), r"'a\\x1b\[2J' is no name"),
+        ("branches", lambda f: f.assign(name=[None, *f.name[1:]]), "'branches': name is empty"),
+        ("branches", lambda f: f.to_dict(), "expected a pandas DataFrame, received dict"),
+        ("network", lambda f: f.assign(base_mva=10**400), "base_mva must be a number"),
+        ("network", lambda f: f.assign(base_mva=[[1.0]]), "base_mva must be a number"),
+    ],
+)
+def test_odd_tables_of_a_grid_are_refused(table: str, change: object, expected: str) -> None:
+    tables = library.load("ieee14").to_tables()
+    tables[table] = change(tables[table])  # type: ignore[operator]
+    with pytest.raises(GridError, match=expected):
+        Network.from_tables(**tables)
+
+
+def test_tables_of_categories_make_the_same_grid() -> None:
+    tables = library.load("ieee14").to_tables()
+    coded = {name: frame.astype("category") for name, frame in tables.items()}
+    for name, frame in Network.from_tables(**coded).to_tables().items():
+        pd.testing.assert_frame_equal(frame, tables[name])
 
 
 def test_base_power_must_be_positive() -> None:

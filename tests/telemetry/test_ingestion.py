@@ -169,7 +169,7 @@ def test_what_was_taken_in_can_be_written_and_read(tmp_path):
         (frame(value=frame().time_utc), "must be numeric, received datetime64"),
         (frame(value=pd.Series([10**400] * 6, dtype=object)), "must be numeric, received object"),
         (frame(channel=[["U6"]] * 6), r"'channel' must hold names, received e.g. \['U6'\]"),
-        (frame(channel=["U6\udcff"] * 6), r"bytes that are no text: .*encoding='cp1252'"),
+        (frame(channel=["U6\udcff"] * 6), r"holds damaged bytes or control .*encoding='cp1252'"),
         (frame().set_index("time_utc"), r"'time_utc' is missing.*pass frame.reset_index\(\)"),
         (frame().T.T.set_axis([["a"] * 3, [1, 2, 3]], axis=1), "column names have 2 levels"),
         (frame().to_dict("list"), "telemetry: expected a pandas DataFrame, received dict"),
@@ -345,7 +345,7 @@ def test_blank_cells_of_a_csv_file_take_their_defaults(tmp_path):
         (("sign", 257), "sign of 'U6' must be 1, or -1 .*; received 257"),
         (("sigma", 1e-13), "sigma of 'U6' is 1e-13, expected 1e-12 … 1e.12"),
         (("period_s", np.inf), "'period_s' of channel 'U6': expected 1e-06 … 1e.09 seconds"),
-        (("channel", "U\udcff6"), "bytes that are no text"),
+        (("channel", "U\udcff6"), "damaged bytes or control characters"),
         (("sign", 1.5), "sign of 'U6' must be 1, or -1 .*; received 1.5"),
     ],
 )

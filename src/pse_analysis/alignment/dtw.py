@@ -47,6 +47,10 @@ METHODS: tuple[Method, ...] = ("none", "xcorr", "dtw")
 NONE, XCORR, DTW = range(3)
 
 
+LONGEST_S = (1e-3, 1e7)
+"""Windows and delays that can be matched, to a season. [s]"""
+
+
 @dataclass(frozen=True)
 class TimeParams:
     """How the sampling times of clockless sources are recovered.
@@ -88,7 +92,12 @@ class TimeParams:
                 raise ParameterError(
                     f"[align] {name} must be positive, received {getattr(self, name)}"
                 )
-        if self.warp_penalty < 0:
+            if not LONGEST_S[0] <= getattr(self, name) <= LONGEST_S[1]:
+                raise ParameterError(
+                    f"[align] {name} must lie in {LONGEST_S[0]:g} … {LONGEST_S[1]:g} s, received "
+                    f"{getattr(self, name)}"
+                )
+        if not 0 <= self.warp_penalty < np.inf:
             raise ParameterError(
                 f"[align] warp_penalty must not be negative, received {self.warp_penalty}"
             )

@@ -23,7 +23,7 @@ from pse_analysis.alignment.stamps import sampling_times
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import Model, SensorLayout, standard_deviation, wrap
-from pse_analysis.parameters import Study
+from pse_analysis.parameters import Study, Unbounded
 from pse_analysis.vocabulary import Origin, Quantity, check
 
 FloatArray = npt.NDArray[np.float64]
@@ -85,8 +85,8 @@ class AlignParams:
     variants: tuple[Variant, ...] = ()
     latency_s: float = 0.0
     interpolate: tuple[str, ...] = ()
-    max_age_s: dict[str, float] = field(default_factory=dict)
-    default_max_age_s: float = 3600.0
+    max_age_s: dict[str, Unbounded] = field(default_factory=dict)
+    default_max_age_s: Unbounded = 3600.0
     growth: Literal["history", "none"] = "history"
     time: TimeParams = field(default_factory=TimeParams)
     pseudo: PseudoParams = field(default_factory=PseudoParams)
@@ -98,8 +98,10 @@ class AlignParams:
                 raise ParameterError(
                     f"[align.variants] the name {name!r} stands twice: give each its own"
                 )
-        if not self.latency_s >= 0:
-            raise ParameterError(f"[align] expected latency_s ≥ 0, received {self.latency_s}")
+        if not 0 <= self.latency_s <= 1e9:
+            raise ParameterError(
+                f"[align] expected latency_s ≥ 0, at most 1e9, received {self.latency_s}"
+            )
         for name, age in {"default_max_age_s": self.default_max_age_s, **self.max_age_s}.items():
             if not age > 0:
                 raise ParameterError(f"[align] expected {name} > 0, received {age}")

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
+from pse_analysis.errors import NotConverged, Unobservable
 from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Snapshot
 from pse_analysis.machine import STATES, Machine
 from pse_analysis.measurement import Model, SensorLayout, wrap
@@ -122,7 +123,16 @@ def run(
     nothing = np.full(len(states), np.nan)
     for k, snapshot in enumerate(snapshots):
         begun = time.perf_counter()
-        state, info = estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
+        try:
+            state, info = (
+                estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
+            )
+        except (NotConverged, Unobservable, np.linalg.LinAlgError) as error:
+            # One snapshot that cannot be computed with stops no run: the next one starts anew.
+            status = (
+                Status.UNOBSERVABLE if isinstance(error, Unobservable) else Status.NOT_CONVERGED
+            )
+            state, info = None, Info.nothing(len(layout), status, str(error))
         seconds = time.perf_counter() - begun
         estimate = None if state is None else estimator.read(state)
         if estimate is not None and not (

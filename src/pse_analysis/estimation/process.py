@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import lapack
 
+from pse_analysis.errors import NotConverged
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
 
@@ -85,6 +86,7 @@ class Sensitivity:
     """
 
     def __init__(self, network: Network) -> None:
+        self._network = network
         n, kind = network.n_bus, network.buses.kind
         angle = np.flatnonzero(np.arange(n) != network.slack)
         self._pq = np.flatnonzero(kind == BusKind.PQ)
@@ -104,8 +106,8 @@ class Sensitivity:
 
         Raises
         ------
-        numpy.linalg.LinAlgError
-            If the power flow is singular there.
+        NotConverged
+            If the power flow is singular there, as where a part of the grid is cut off.
         """
         n, pq, pv, held = len(voltage), self._pq, self._pv, self.held
         carried = voltage[:, None] * self._admittance
@@ -127,7 +129,14 @@ class Sensitivity:
         right = np.concatenate([np.eye(len(self.inputs)), -grown], axis=1)
         _, _, solved, singular = lapack.dgesv(unknown, right, overwrite_a=1, overwrite_b=1)
         if singular:
-            raise np.linalg.LinAlgError("the power flow is singular at this voltage")
+            island = self._network.islands()
+            apart = np.flatnonzero(island != island[self._network.slack])
+            names = ", ".join(self._network.buses.name[i] for i in apart[:5])
+            why = f": no path leads from the slack bus to {names}" if len(apart) else ""
+            raise NotConverged(
+                f"the power flow of {self._network.name} is singular at this voltage{why}; close a "
+                'branch, drop the buses that are cut off, or use noise = "scalar"'
+            )
         moved = np.zeros((2 * n, right.shape[1]))
         moved[pq], moved[n + pq] = solved[: len(pq)], solved[len(pq) : 2 * len(pq)]
         theta = solved[2 * len(pq) :]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import GridError
-from pse_analysis.vocabulary import shown
+from pse_analysis.vocabulary import as_number, shown
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -166,9 +166,12 @@ def _numbers(columns: Columns, field: str, values: npt.NDArray[Any]) -> FloatArr
         for at, value in enumerate(values):
             word = str(value).strip().lower()
             try:
-                numbers[at] = _WORDS[word] if codes and word in _WORDS else float(value)
-            except (TypeError, ValueError):
+                numbers[at] = _WORDS[word] if codes and word in _WORDS else as_number(value)
+            except (TypeError, ValueError, OverflowError):
                 refused[at] = True
+    if field in ("from_bus", "to_bus"):
+        wanted = "the position of a bus"
+        refused |= ~(np.abs(numbers) < 2**53) | (numbers != np.rint(numbers))
     if codes:
         refused |= ~np.isin(numbers, codes)
     if refused.any():

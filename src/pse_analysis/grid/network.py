@@ -22,20 +22,16 @@ import pandas as pd
 from scipy import sparse
 
 from pse_analysis.errors import GridError
-from pse_analysis.grid.elements import (
-    OPTIONAL,
-    Branches,
-    Buses,
-    BusKind,
-    branch_names,
-    check_spelling,
-    freeze,
-)
-from pse_analysis.vocabulary import shown
+from pse_analysis.grid.elements import Branches, Buses, BusKind, freeze
+from pse_analysis.grid.plausibility import check_plausible
+from pse_analysis.grid.reading import read_tables
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
+
+BASE_MVA = (1e-6, 1e9)
+"""Base powers from that of a toy to that of all grids together. [MVA]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +51,8 @@ class Network:
     ------
     GridError
         On repeated names, an end bus that does not exist, a zero series impedance, a value that is
-        not finite, a ratio or rated voltage that is not positive, or anything but one slack bus.
+        not finite or cannot be in its unit (`pse_analysis.grid.plausibility`), or anything but one
+        slack bus.
     """
 
     name: str
@@ -67,9 +64,10 @@ class Network:
         freeze(self.buses)
         freeze(self.branches)
         bus, branch = self.buses, self.branches
-        if not 0 < self.base_mva < np.inf:
+        if not BASE_MVA[0] <= self.base_mva <= BASE_MVA[1]:
             raise GridError(
-                f"{self.name}: base_mva must be positive and finite, received {self.base_mva}"
+                f"{self.name}: base_mva must be positive and finite, received {self.base_mva}; "
+                f"expected {BASE_MVA[0]:g} … {BASE_MVA[1]:g} MVA"
             )
         for table, names in (("buses", bus.name), ("branches", branch.name)):
             if len(set(names)) != len(names):
@@ -90,35 +88,7 @@ class Network:
                 f"{self.name}: branch {culprit!r} ends at the bus where it begins: leave it out, "
                 "or mend its ends"
             )
-        short = branch.in_service & (branch.r_pu == 0) & (branch.x_pu == 0)
-        if short.any():
-            culprit = branch.name[int(np.argmax(short))]
-            raise GridError(
-                f"{self.name}: branch {culprit!r} has zero impedance: merge its buses instead"
-            )
-        for table, columns in (("buses", bus), ("branches", branch)):
-            for field in dataclasses.fields(columns):
-                if field.name in ("name", "q_min_mvar", "q_max_mvar"):
-                    continue
-                values = np.asarray(getattr(columns, field.name), dtype=float)
-                if not np.isfinite(values).all():
-                    culprit = columns.name[int(np.argmin(np.isfinite(values)))]
-                    raise GridError(
-                        f"{self.name}: {table}.{field.name} must be finite, "
-                        f"{culprit!r} has {values[~np.isfinite(values)][0]}"
-                    )
-        for of, column, good, wanted in (
-            (branch, "tap", branch.tap > 0, "positive: 1 where there is no transformer"),
-            (bus, "vn_kv", bus.vn_kv > 0, "positive"),
-            (bus, "q_min_mvar", ~np.isnan(bus.q_min_mvar), "a number: -inf where none is known"),
-            (bus, "q_max_mvar", ~np.isnan(bus.q_max_mvar), "a number: inf where none is known"),
-        ):
-            if not good.all():
-                at = int(np.argmin(good))
-                raise GridError(
-                    f"{self.name}: {column} of {'branch' if of is branch else 'bus'} "
-                    f"{of.name[at]!r} must be {wanted}; received {getattr(of, column)[at]}"
-                )
+        check_plausible(self.name, bus, branch)
         slacks = int((bus.kind == BusKind.SLACK).sum())
         if slacks != 1:
             raise GridError(f"{self.name}: expected one slack bus, received {slacks}")
@@ -334,74 +304,4 @@ class Network:
             On a missing or misspelt column, a value that is no number, or a branch that ends at an
             unknown bus.
         """
-        for table, given_table, kind in (("buses", buses, Buses), ("branches", branches, Branches)):
-            known = [f.name for f in dataclasses.fields(kind) if f.name != "name"]
-            check_spelling(table, given_table.columns, known)
-        own = {f.name for f in dataclasses.fields(Buses)}
-        given = {k: v for k, v in OPTIONAL.items() if k in own and k not in buses}
-        buses = buses.assign(**given)
-        own = {f.name for f in dataclasses.fields(Branches)}
-        given = {k: v for k, v in OPTIONAL.items() if k in own and k not in branches}
-        branches = branches.assign(**given)
-        if "name" not in branches and {"from_bus", "to_bus"} <= set(branches.columns):
-            branches = branches.assign(name=branch_names(branches))
-        wanted = {
-            "network": (network, ["name", "base_mva"]),
-            "buses": (buses, [f.name for f in dataclasses.fields(Buses)]),
-            "branches": (branches, [f.name for f in dataclasses.fields(Branches)]),
-        }
-        for table, (frame, columns) in wanted.items():
-            missing = [n for n in columns if n not in frame.columns]
-            if missing:
-                raise GridError(
-                    f"grid table {table!r}: column {missing[0]!r} is missing; expected "
-                    f"{', '.join(columns)}; received {', '.join(map(str, frame.columns))}"
-                )
-        if len(network) != 1:
-            raise GridError(f"grid table 'network': expected one row, received {len(network)}")
-        if buses["name"].isna().any():
-            raise GridError(
-                f"grid table 'buses': name is empty in row {int(np.argmax(buses['name'].isna()))}: "
-                "name that bus, or leave it out"
-            )
-        names = tuple(buses["name"].astype(str))
-        if len(set(names)) != len(names):
-            repeated = next(n for n in names if names.count(n) > 1)
-            raise GridError(f"grid table 'buses': name {repeated!r} repeats: give each bus its own")
-        position = {n: i for i, n in enumerate(names)}
-        ends: dict[str, list[int]] = {}
-        for end in ("from_bus", "to_bus"):
-            labels = branches[end].astype(str)
-            unknown = [b for b in labels if b not in position]
-            if unknown:
-                raise GridError(
-                    f"grid table 'branches': {end} {unknown[0]!r} is no bus; expected a name of "
-                    f"grid table 'buses', as {', '.join(names[:6])}"
-                )
-            ends[end] = [position[b] for b in labels]
-        bus_columns = {
-            f.name: buses[f.name].to_numpy() for f in dataclasses.fields(Buses) if f.name != "name"
-        }
-        branch_columns = {
-            f.name: branches[f.name].to_numpy()
-            for f in dataclasses.fields(Branches)
-            if f.name not in ("name", "from_bus", "to_bus")
-        }
-        try:
-            base_mva = float(network["base_mva"].iloc[0])
-        except (TypeError, ValueError) as error:
-            raise GridError(
-                "grid table 'network': base_mva must be a number, received "
-                f"{shown(network['base_mva'].iloc[0])}"
-            ) from error
-        return cls(
-            name=str(network["name"].iloc[0]),
-            base_mva=base_mva,
-            buses=Buses(name=names, **bus_columns),
-            branches=Branches(
-                name=tuple(branches["name"].astype(str)),
-                from_bus=np.asarray(ends["from_bus"]),
-                to_bus=np.asarray(ends["to_bus"]),
-                **branch_columns,
-            ),
-        )
+        return cls(*read_tables(network, buses, branches))

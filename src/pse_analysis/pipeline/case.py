@@ -15,10 +15,12 @@ from types import MappingProxyType
 from typing import Any
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.parameters import Study, build
+from pse_analysis.parameters import Study, brief, build
 
 NAME = re.compile(r"[a-z0-9_-]+")
 TEXTS = ("title", "grid", "notebook")
+MOST_BYTES = 1 << 20
+"""Size of a case file; the longest of this project has some ten thousand."""
 SERIES = ("generated", "curves")
 """Tables of ``simulate`` that make a case of metered loads."""
 SECTIONS = ("machine", "study", "simulate", "validate", "align", "estimate", "score")
@@ -132,13 +134,32 @@ def load_case(name: str, cases: Path | None = None) -> Case:
         raise ParameterError(
             f"no case {name!r} in {folder}: {hint}expected any of {', '.join(known) or '(none)'}"
         )
+    return _check(name, path, _read(path))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The tables of a case file."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise ParameterError(
+                f"{path}: expected a case file of at most {MOST_BYTES} bytes, received {size}: "
+                "telemetry belongs into the raw folder"
+            )
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ParameterError(f"{path}: not valid TOML: {error}") from error
     except UnicodeDecodeError as error:
         raise ParameterError(f"{path}: expected UTF-8 text, received {error.reason}") from error
-    return _check(name, path, data)
+    except ParameterError:
+        raise
+    except (ValueError, RecursionError) as error:  # numbers of 4,300 digits, brackets in brackets
+        why = str(error) or "its tables are nested too deeply"
+        raise ParameterError(f"{path}: cannot be read: {why}") from error
+    except OSError as error:
+        raise ParameterError(
+            f"{path}: cannot be read ({error.strerror}): check its owner and mode"
+        ) from error
 
 
 def _check(name: str, path: Path, data: dict[str, Any]) -> Case:
@@ -152,7 +173,12 @@ def _check(name: str, path: Path, data: dict[str, Any]) -> Case:
             )
         kind, expected = (str, "a text") if key in TEXTS else (dict, f"a table [{key}]")
         if not isinstance(value, kind):
-            raise ParameterError(f"{path}: {key} must be {expected}, received {value!r}")
+            raise ParameterError(f"{path}: {key} must be {expected}, received {brief(value)}")
+        if isinstance(value, str) and not (value.strip() and value.isprintable()):
+            raise ParameterError(
+                f"{path}: {key} must be a text of one line without control characters, received "
+                f"{brief(value)}"
+            )
     for key in ("title", "study"):
         if key not in data:
             raise ParameterError(f"{path}: {key!r} is missing: add it to the case file")
@@ -165,8 +191,8 @@ def _check(name: str, path: Path, data: dict[str, Any]) -> Case:
         )
     if "grid" in data and "simulate" not in data:
         raise ParameterError(
-            f"{path}: grid = {data['grid']!r} is simulated, but there is no table [simulate]: drop "
-            "it to use the grid in the raw folder, or add [simulate]"
+            f"{path}: grid = {brief(data['grid'])} is simulated, but there is no table [simulate]: "
+            "drop it to use the grid in the raw folder, or add [simulate]"
         )
     if "simulate" in data and not models:
         raise ParameterError(

@@ -12,7 +12,7 @@ from pse_analysis.parameters import Study
 from pse_analysis.simulation import faults, scenario, sensors
 from pse_analysis.simulation.scenario import SECOND, Truth, microseconds
 from pse_analysis.simulation.sensors import Samples
-from pse_analysis.simulation.settings import SimulateParams
+from pse_analysis.simulation.settings import SimulateParams, require_few
 from pse_analysis.telemetry import RawCase
 from pse_analysis.vocabulary import FaultKind, Quantity
 
@@ -48,9 +48,13 @@ def simulate(
     NotConverged
         If a state has no power flow.
     """
+    span = (study.end - study.history_start).total_seconds()
+    require_few(network.n_bus * span / params.truth_step_s, "true states of buses")
     time = scenario.truth_times(study, params.truth_step_s)
     groups = sensors.channels(network, params.sensors)
     channels = pd.concat(groups, ignore_index=True)
+    read = sum(len(g) * span / p.period_s for g, p in zip(groups, params.sensors, strict=True))
+    require_few(params.trials * read, "samples")
     first_channel = np.cumsum([0, *(len(g) for g in groups)])
     case_seed, *trial_seeds = np.random.SeedSequence(params.seed).spawn(1 + params.trials)
     start, end = (pd.Timestamp(int(t), unit="us", tz="UTC") for t in (time[0], time[-1]))

@@ -21,6 +21,13 @@ from pse_analysis.machine import Densities, Machine
 FloatArray = npt.NDArray[np.float64]
 
 
+LARGEST_GAIN = 1e4
+"""Gains and times of a governor; beyond them its motion is stiff, and solving it never ends."""
+LARGEST_LOAD = 1e9
+FASTEST_S = 1e-3
+"""Time constant of the fastest turbine. [s]"""
+
+
 @dataclass(frozen=True)
 class GovernorParams:
     """Proportional-derivative governor: p_ref = p₀ - k_p Δω - k_v dΔω/dt, Δω per unit.
@@ -40,10 +47,15 @@ class GovernorParams:
     time_constant_s: float = 0.3
 
     def __post_init__(self) -> None:
-        if not (self.proportional >= 0 and self.derivative_s >= 0 and self.time_constant_s > 0):
+        if not (
+            0 <= self.proportional <= LARGEST_GAIN
+            and 0 <= self.derivative_s <= LARGEST_GAIN
+            and FASTEST_S <= self.time_constant_s <= LARGEST_GAIN
+        ):
             raise ParameterError(
                 "[governor] expected proportional ≥ 0, derivative_s ≥ 0 and time_constant_s > 0, "
-                f"received {self}"
+                f"received {self}; none above {LARGEST_GAIN:g}, and no time constant below "
+                f"{FASTEST_S:g} s"
             )
 
 
@@ -65,6 +77,14 @@ class LoadStepParams:
     step_mw: float = 10.0
     step_at_s: float = 5.0
     per_speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("load_mw", "step_mw", "step_at_s", "per_speed"):
+            if not abs(getattr(self, name)) <= LARGEST_LOAD:
+                raise ParameterError(
+                    f"[simulate.load] {name} must be finite, at most {LARGEST_LOAD:g} in size, "
+                    f"received {getattr(self, name)}"
+                )
 
     def at(self, time_s: float) -> float:
         """Load at nominal speed; at the instant of the step it is on. [MW]"""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,13 +11,13 @@ import pandas as pd
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.machine import INPUT, STATES, Densities, Machine
-from pse_analysis.parameters import Study
+from pse_analysis.parameters import Study, Unbounded
 from pse_analysis.simulation import faults
 from pse_analysis.simulation.case import sample_tables, utc
 from pse_analysis.simulation.machine import GovernorParams, LoadStepParams, disturb, load_step
 from pse_analysis.simulation.scenario import SECOND, microseconds
 from pse_analysis.simulation.sensors import Samples
-from pse_analysis.simulation.settings import FaultParams
+from pse_analysis.simulation.settings import LONGEST_S, SHORTEST_S, FaultParams, require_few
 from pse_analysis.telemetry import RawCase
 from pse_analysis.vocabulary import Aggregation, SigmaKind, Source
 
@@ -59,24 +60,38 @@ class MachineSimulateParams:
     start: tuple[float, float] = (0.0, 0.0)
     start_sigma: tuple[float, float] = (0.0, 0.0)
     delta_m_sigma: float = 1e-4
-    angle_limits: tuple[float, float] = (-1000.0, 1000.0)
-    delta_m_limits: tuple[float, float] = (-1.0, 1.0)
+    angle_limits: tuple[Unbounded, Unbounded] = (-1000.0, 1000.0)
+    delta_m_limits: tuple[Unbounded, Unbounded] = (-1.0, 1.0)
     load: LoadStepParams = field(default_factory=LoadStepParams)
     governor: GovernorParams = field(default_factory=GovernorParams)
     faults: tuple[FaultParams, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, low in (("seed", 0), ("trials", 1), ("every", 1)):
-            if getattr(self, name) < low:
+        for name, low, high in (("seed", 0.0, math.inf), ("trials", 1.0, 1e6), ("every", 1.0, 1e4)):
+            if not low <= getattr(self, name) <= high:
                 raise ParameterError(
-                    f"[simulate] {name} must be ≥ {low}, received {getattr(self, name)}"
+                    f"[simulate] {name} must be ≥ {low:g}, at most {high:g}, received "
+                    f"{getattr(self, name)}"
                 )
-        for name in ("period_s", "delta_m_sigma"):
-            if not getattr(self, name) > 0:
+        for name, low, high in (("period_s", SHORTEST_S, LONGEST_S), ("delta_m_sigma", 1e-12, 1e6)):
+            if not low <= getattr(self, name) <= high:
                 raise ParameterError(
-                    f"[simulate] {name} must be above 0, received {getattr(self, name)}"
+                    f"[simulate] {name} must be above 0, {low:g} … {high:g}, received "
+                    f"{getattr(self, name)}"
                 )
-        if not (min(self.densities.theta, self.densities.omega) >= 0 < self.densities.angle):
+        for name in ("start", "start_sigma"):
+            if not all(math.isfinite(v) for v in getattr(self, name)) or (
+                name == "start_sigma" and min(self.start_sigma) < 0
+            ):
+                raise ParameterError(
+                    f"[simulate] {name} must hold two finite numbers"
+                    f"{' ≥ 0' if name == 'start_sigma' else ''}, received {getattr(self, name)}"
+                )
+        density = self.densities
+        if not (
+            min(density.theta, density.omega) >= 0 < density.angle
+            and max(density.theta, density.omega, density.angle) <= 1e12
+        ):
             raise ParameterError(
                 "[simulate] densities: expected theta ≥ 0, omega ≥ 0 and angle > 0, received "
                 f"{self.densities}"
@@ -111,6 +126,8 @@ def simulate_machine(machine: Machine, study: Study, params: MachineSimulatePara
             f"[simulate] period_s = {params.period_s} must divide the study's step_s = "
             f"{study.step_s} and history_s = {study.history_s}: choose e.g. period_s = step_s"
         )
+    span = (study.end - study.history_start).total_seconds()
+    require_few(2 * params.trials * params.every * span / params.period_s, "values of noise")
     origin, end = microseconds(study.start), microseconds(study.end)
     time = np.arange(microseconds(study.history_start), end, period, dtype=np.int64)
     seconds = (time - origin) / SECOND

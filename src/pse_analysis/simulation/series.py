@@ -17,13 +17,13 @@ import pandas as pd
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
-from pse_analysis.parameters import Study
+from pse_analysis.parameters import Study, Unbounded
 from pse_analysis.simulation import faults
 from pse_analysis.simulation.case import sample_tables, utc
 from pse_analysis.simulation.profiles import PROFILE_STEP_S, ar1, column
 from pse_analysis.simulation.scenario import SECOND, microseconds
 from pse_analysis.simulation.sensors import Samples
-from pse_analysis.simulation.settings import FaultParams
+from pse_analysis.simulation.settings import LONGEST_S, SHORTEST_S, FaultParams, require_few
 from pse_analysis.telemetry import RawCase
 from pse_analysis.vocabulary import Aggregation, Quantity, SigmaKind, Source
 
@@ -34,6 +34,7 @@ SOURCE_BUS = "source"
 BASE_MVA = 100.0
 VN_KV = 110.0
 _X_PU = 0.01
+LARGEST_MW = 1e9
 
 
 @dataclass(frozen=True)
@@ -77,15 +78,19 @@ class GeneratedParams:
     sigma_mw: float
     rho1: float = 0.5
     period_s: float = 120.0
-    limits: tuple[float, float] = (0.0, np.inf)
+    limits: tuple[Unbounded, Unbounded] = (0.0, np.inf)
     steps: tuple[StepParams, ...] = ()
 
     def __post_init__(self) -> None:
         where = f"[simulate.generated] {self.name}"
-        if not (self.sigma_mw > 0 and self.period_s > 0):
+        if not (0 < self.sigma_mw <= LARGEST_MW and SHORTEST_S <= self.period_s <= LONGEST_S):
             raise ParameterError(
                 f"{where}: expected sigma_mw > 0 and period_s > 0, received {self.sigma_mw} and "
-                f"{self.period_s}"
+                f"{self.period_s}; at most {LARGEST_MW:g} MW, and {SHORTEST_S:g} … {LONGEST_S:g} s"
+            )
+        if not abs(self.level_mw) <= LARGEST_MW:
+            raise ParameterError(
+                f"{where}: expected level_mw of at most {LARGEST_MW:g}, received {self.level_mw}"
             )
         if not -1.0 < self.rho1 < 1.0:
             raise ParameterError(f"{where}: expected -1 < rho1 < 1, received {self.rho1}")
@@ -110,12 +115,13 @@ class CurveParams:
     name: str
     profile: str
     peak_mw: float
-    limits: tuple[float, float] = (0.0, np.inf)
+    limits: tuple[Unbounded, Unbounded] = (0.0, np.inf)
 
     def __post_init__(self) -> None:
-        if not self.peak_mw > 0:
+        if not 0 < self.peak_mw <= LARGEST_MW:
             raise ParameterError(
-                f"[simulate.curves] {self.name}: expected peak_mw > 0, received {self.peak_mw}"
+                f"[simulate.curves] {self.name}: expected peak_mw > 0, at most {LARGEST_MW:g}, "
+                f"received {self.peak_mw}"
             )
 
 
@@ -150,8 +156,11 @@ class SeriesSimulateParams:
                 raise ParameterError(
                     f"[simulate] {name} must be ≥ {low}, received {getattr(self, name)}"
                 )
-        if not self.accuracy > 0:
-            raise ParameterError(f"[simulate] accuracy must be > 0, received {self.accuracy}")
+        if not 1e-12 <= self.accuracy <= 1:
+            raise ParameterError(
+                f"[simulate] accuracy must be > 0, a fraction of the reading of at most 1, "
+                f"received {self.accuracy}"
+            )
         names = [one.name for one in self.metered]
         if not names:
             raise ParameterError(
@@ -202,6 +211,10 @@ def simulate_series(profiles: pd.DataFrame, study: Study, params: SeriesSimulate
         If a curve is unknown or does not cover the record.
     """
     start, end = microseconds(study.history_start), microseconds(study.end)
+    span = (end - start) / SECOND
+    drawn_values = sum(span / one.period_s for one in params.generated)
+    drawn_values += len(params.curves) * span / PROFILE_STEP_S
+    require_few(params.trials * drawn_values, "samples")
     real = [_curve(profiles, one, start, end) for one in params.curves]
     channels = _channels(params)
     parts: list[tuple[pd.DataFrame, ...]] = []

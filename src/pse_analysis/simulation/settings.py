@@ -9,12 +9,35 @@ from datetime import datetime
 from typing import Literal
 
 from pse_analysis.errors import ParameterError
+from pse_analysis.parameters import Unbounded
 from pse_analysis.vocabulary import FaultKind, Quantity, Source
+
+SHORTEST_S = 1e-6
+"""Stamps count microseconds. [s]"""
+LONGEST_S = 1e9
+"""Thirty years, beyond any study. [s]"""
+MOST_SAMPLES = 300_000_000
+"""Samples, or true values, of one simulation, which are held in memory."""
 
 
 def _require(condition: bool, where: str, expected: str, received: object) -> None:
     if not condition:
         raise ParameterError(f"[{where}] expected {expected}, received {received!r}")
+
+
+def require_few(count: float, what: str) -> None:
+    """Refuse a simulation that does not fit into memory.
+
+    Raises
+    ------
+    ParameterError
+        With the number of values, and what makes them fewer.
+    """
+    if not count <= MOST_SAMPLES:
+        raise ParameterError(
+            f"[simulate] {count:.3g} {what} are to be drawn, expected at most {MOST_SAMPLES:g}: "
+            "raise period_s or truth_step_s, or lower trials, history_s or the number of channels"
+        )
 
 
 @dataclass(frozen=True)
@@ -51,10 +74,15 @@ class LoadParams:
         where = "simulate.load"
         n = len(self.classes)
         _require(1 <= self.per_bus <= n, where, f"per_bus in 1 … {n}", self.per_bus)
-        _require(self.concentration > 0, where, "concentration > 0", self.concentration)
-        _require(self.level > 0, where, "level > 0", self.level)
+        _require(
+            1e-3 <= self.concentration <= 1e6,
+            where,
+            "concentration > 0, 0.001 … 1e6",
+            self.concentration,
+        )
+        _require(0 < self.level <= 1e3, where, "level > 0, at most 1000", self.level)
         _require(-1 < self.rho1 < 1, where, "-1 < rho1 < 1", self.rho1)
-        _require(self.window >= 1, where, "window ≥ 1", self.window)
+        _require(1 <= self.window <= 1e6, where, "window ≥ 1, at most 1e6", self.window)
 
 
 @dataclass(frozen=True)
@@ -77,10 +105,18 @@ class SourceVoltageParams:
 
     def __post_init__(self) -> None:
         where = "simulate.source_voltage"
-        _require(self.sigma_pu >= 0, where, "sigma_pu ≥ 0", self.sigma_pu)
-        _require(self.time_constant_s > 0, where, "time_constant_s > 0", self.time_constant_s)
-        _require(self.taps_per_day >= 0, where, "taps_per_day ≥ 0", self.taps_per_day)
-        _require(self.max_taps >= 0, where, "max_taps ≥ 0", self.max_taps)
+        _require(0 <= self.sigma_pu <= 1, where, "sigma_pu ≥ 0, at most 1", self.sigma_pu)
+        _require(
+            SHORTEST_S <= self.time_constant_s <= LONGEST_S,
+            where,
+            f"time_constant_s > 0, {SHORTEST_S:g} … {LONGEST_S:g}",
+            self.time_constant_s,
+        )
+        _require(abs(self.tap_pu) <= 1, where, "tap_pu of at most 1 in size", self.tap_pu)
+        _require(
+            0 <= self.taps_per_day <= 1e6, where, "taps_per_day ≥ 0, at most 1e6", self.taps_per_day
+        )
+        _require(0 <= self.max_taps <= 1000, where, "max_taps ≥ 0, at most 1000", self.max_taps)
 
 
 @dataclass(frozen=True)
@@ -106,10 +142,15 @@ class LoadStepParams:
 
     def __post_init__(self) -> None:
         where = "simulate.load_steps"
-        _require(self.per_day >= 0, where, "per_day ≥ 0", self.per_day)
-        for name in ("size", "duration_s"):
+        _require(0 <= self.per_day <= 1e5, where, "per_day ≥ 0, at most 1e5", self.per_day)
+        for name, most in (("size", 1e3), ("duration_s", LONGEST_S)):
             low, high = getattr(self, name)
-            _require(0 < low <= high, where, f"{name} = [low, high], 0 < low ≤ high", (low, high))
+            _require(
+                0 < low <= high <= most,
+                where,
+                f"{name} = [low, high], 0 < low ≤ high ≤ {most:g}",
+                (low, high),
+            )
 
 
 @dataclass(frozen=True)
@@ -119,6 +160,9 @@ class PvParams:
     bus: str
     peak_mw: float
     profile: str = "PV1"
+
+    def __post_init__(self) -> None:
+        _require(abs(self.peak_mw) <= 1e6, "simulate.pv", "peak_mw of at most 1e6", self.peak_mw)
 
 
 @dataclass(frozen=True)
@@ -177,7 +221,7 @@ class SensorParams:
     wander_time_s: float = 1800.0
     stamp: Literal["sampling", "arrival"] = "sampling"
     sign: Literal[1, -1] = 1
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    limits: Mapping[str, tuple[Unbounded, Unbounded]] = field(default_factory=dict)
     limit_factor: float = 0.0
 
     def __post_init__(self) -> None:
@@ -189,10 +233,29 @@ class SensorParams:
             _require(name in known, where, f"quantities in {', '.join(known)}", name)
         _require(bool(self.quantities) and bool(self.at), where, "quantities and at", self.at)
         _require(self.sigma > 0, where, "sigma > 0", self.sigma)
-        _require(self.period_s > 0, where, "period_s > 0", self.period_s)
+        _require(1e-12 <= self.sigma <= 1e12, where, "sigma in 1e-12 … 1e12", self.sigma)
+        _require(
+            self.sigma_kind != "relative" or self.sigma <= 1,
+            where,
+            "a relative sigma of at most 1, a fraction of the magnitude (1 % is 0.01)",
+            self.sigma,
+        )
+        for name in ("period_s", "wander_time_s"):
+            _require(
+                SHORTEST_S <= getattr(self, name) <= LONGEST_S,
+                where,
+                f"{name} > 0, {SHORTEST_S:g} … {LONGEST_S:g}",
+                getattr(self, name),
+            )
         for name in ("phase_s", "delay_s", "jitter_s", "wander_s", "limit_factor"):
-            _require(getattr(self, name) >= 0, where, f"{name} ≥ 0", getattr(self, name))
-        _require(self.wander_time_s > 0, where, "wander_time_s > 0", self.wander_time_s)
+            _require(
+                0 <= getattr(self, name) <= LONGEST_S,
+                where,
+                f"{name} ≥ 0, at most {LONGEST_S:g}",
+                getattr(self, name),
+            )
+        for name, (low, high) in self.limits.items():
+            _require(low <= high, where, f"limits of {name} = [low, high], low ≤ high", (low, high))
         if self.wander_s:
             # Five standard deviations of the drift over a period, where it drifts fastest.
             fraction = 2.0 * self.period_s / self.wander_time_s
@@ -249,12 +312,22 @@ class FaultParams:
         _require(0 <= self.rate <= 1, where, "rate in 0 … 1", self.rate)
         low, high = self.size
         needs_size = self.kind not in (FaultKind.LOST, FaultKind.EMPTY)
+        most = 1e6 if self.kind == FaultKind.SPIKE else LONGEST_S
         _require(
-            (0 < low <= high) if needs_size else True,
+            (0 < low <= high <= most) if needs_size else True,
             where,
-            f"size = [low, high] with 0 < low ≤ high for {self.kind!r}",
+            f"size = [low, high] with 0 < low ≤ high ≤ {most:g} for {self.kind!r}",
             self.size,
         )
+        _require(
+            not self.source or self.source in [str(s) for s in Source],
+            where,
+            f"source in {', '.join(Source)}, or none for all",
+            self.source,
+        )
+        known = [str(q) for q in Quantity]
+        for name in self.quantities:
+            _require(name in known, where, f"quantities in {', '.join(known)}", name)
         for name in ("start", "end"):
             time = getattr(self, name)
             _require(time is None or time.tzinfo is not None, where, f"{name} with 'Z'", time)
@@ -290,7 +363,7 @@ class SimulateParams:
         _require(self.seed >= 0, "simulate", "seed ≥ 0", self.seed)
         _require(self.trials >= 1, "simulate", "trials ≥ 1", self.trials)
         _require(
-            self.truth_step_s > 0 and (900.0 / self.truth_step_s).is_integer(),
+            SHORTEST_S <= self.truth_step_s <= 900 and (900.0 / self.truth_step_s).is_integer(),
             "simulate",
             "truth_step_s that divides 900",
             self.truth_step_s,

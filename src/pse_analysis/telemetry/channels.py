@@ -48,8 +48,8 @@ def check_channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     damaged = unwritable([*checked["channel"], *checked["element"]])
     if damaged:
         raise TableError(
-            f"channels: {damaged[0]!r} holds bytes that are no text: read the source with its own "
-            "encoding, e.g. encoding='cp1252'"
+            f"channels: {damaged[0]!r} holds damaged bytes or control characters: read the source "
+            "with its own encoding, e.g. encoding='cp1252', or clean the name"
         )
     crossed = checked["lower"] > checked["upper"]
     if crossed.any():

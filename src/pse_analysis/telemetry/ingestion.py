@@ -216,8 +216,8 @@ def _tagged(
     damaged = unwritable([one for several in channels for one in several])
     if damaged:
         raise TableError(
-            f"telemetry: channel {damaged[0]!r} holds bytes that are no text: read the source with "
-            "its own encoding, e.g. encoding='cp1252'"
+            f"telemetry: channel {damaged[0]!r} holds damaged bytes or control characters: read "
+            "the source with its own encoding, e.g. encoding='cp1252', or clean the name"
         )
     count = np.array([len(several) for several in channels], dtype=np.intp)[code]
     source = np.repeat(np.arange(len(own)), count)

@@ -13,6 +13,7 @@ import pandas as pd
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.measurement import Model, SensorLayout
+from pse_analysis.parameters import Unbounded
 from pse_analysis.validation.default_limits import DefaultLimits, physical_limits
 from pse_analysis.validation.thresholds import DEFAULT_AMPLITUDE
 from pse_analysis.vocabulary import UNITS, Quantity, plain_unit
@@ -32,6 +33,12 @@ SCALES: Mapping[tuple[str, str], float] = {
 
 LEAST_VOLTAGE = 5e-324
 """Least magnitude of a voltage, in any unit: a bus at zero has no state to be estimated."""
+
+
+MOST_IN_A_ROW = 1_000_000
+"""Samples that a check may count before it decides."""
+MOST_BINS = 1440
+"""Parts of a day: a minute each."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +96,8 @@ class Rule:
     channel: str = "*"
     checks: tuple[str, ...] | None = None
     unit: str | None = None
-    lower: float | None = None
-    upper: float | None = None
+    lower: Unbounded | None = None
+    upper: Unbounded | None = None
     increment: float | None = None
     criterion: Literal["bayes", "minimax", "fixed"] | None = None
     amplitude: float | None = None
@@ -103,7 +110,7 @@ class Rule:
     confirm: int | None = None
     stuck: int | None = None
     stuck_at_zero: bool | None = None
-    late_s: float | None = None
+    late_s: Unbounded | None = None
     bad_quality: tuple[int, ...] | None = None
     time_of_day_bins: int | None = None
 
@@ -129,10 +136,16 @@ class Rule:
                 raise ParameterError(
                     f"[validate.rules] {name} is a probability: expected 0 … 1, received {value}"
                 )
-        for name, low in (("confirm", 1), ("stuck", 0), ("late_s", 0), ("time_of_day_bins", 0)):
+        for name, low, high in (
+            ("confirm", 1, MOST_IN_A_ROW), ("stuck", 0, MOST_IN_A_ROW), ("late_s", 0, math.inf),
+            ("time_of_day_bins", 0, MOST_BINS),
+        ):  # fmt: skip
             value = getattr(self, name)
-            if value is not None and value < low:
-                raise ParameterError(f"[validate.rules] {name} must be ≥ {low}, received {value}")
+            if value is not None and not low <= value <= high:
+                raise ParameterError(
+                    f"[validate.rules] {name} must be ≥ {low}, received {value}"
+                    f"{f'; at most {high}' if value > high else ''}"
+                )
         if isinstance(self.k, float | int) and not -1.0 <= self.k <= 2.0:
             raise ParameterError(
                 f"[validate.rules] k is the share of the last increment that is expected again: "

@@ -26,7 +26,7 @@ NIS, NEES       normalised squared innovation ηᵀS⁻¹η and state error eᵀ
 
 from __future__ import annotations
 
-from pse_analysis.vocabulary.columns import plain_columns, plain_values, unwritable
+from pse_analysis.vocabulary.columns import as_number, plain_columns, plain_values, unwritable
 from pse_analysis.vocabulary.schemas import KEYS, check, schema, shown
 from pse_analysis.vocabulary.terms import (
     SEVERITY,
@@ -60,6 +60,7 @@ __all__ = [
     "SigmaKind",
     "Source",
     "Status",
+    "as_number",
     "check",
     "plain_columns",
     "plain_unit",

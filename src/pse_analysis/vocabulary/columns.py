@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,9 @@ from pse_analysis.errors import PseError, TableError
 
 if TYPE_CHECKING:
     import pandas as pd
+
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+"""Characters that end a line, drive a terminal or turn the direction of what follows."""
 
 
 def plain_columns(
@@ -129,12 +133,28 @@ def _from_arrow(what: str, series: pd.Series, error: type[PseError]) -> pd.Serie
     return plain_values(what, pd.Series(values.array, series.index, name=series.name))
 
 
+def as_number(value: object) -> float:
+    """A cell as a number, also where a table spells it as text.
+
+    Raises
+    ------
+    TypeError, ValueError, OverflowError
+        If it is none, or a complex one.
+    """
+    if isinstance(value, complex | np.complexfloating):
+        raise TypeError(f"expected a real number, received {value}")
+    return float(value)  # type: ignore[arg-type]
+
+
 def unwritable(names: Collection[str]) -> list[str]:
-    """Names that are no valid Unicode text, as damaged files leave them; empty if all are."""
+    """Names that files and terminals cannot hold: damaged text, and control characters."""
     found = []
     for name in names:
         try:
             name.encode("utf-8")
         except UnicodeEncodeError:
             found.append(name)
+        else:
+            if not name.isprintable() and CONTROL.search(name):
+                found.append(name)
     return found
