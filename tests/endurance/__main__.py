@@ -1,4 +1,4 @@
-"""Long forms of the tests of endurance: ``python -m tests.endurance kills|flips --count N``."""
+"""Long forms of the tests of endurance: ``python -m tests.endurance FORM --count N``."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import argparse
 import sys
 import time
 
-from tests.endurance import flips, kills
+from tests.endurance import flips, kills, mutations
 
-FORMS = {"kills": kills, "flips": flips}
+FORMS = {"kills": kills, "flips": flips, "mutations": mutations}
 
 
 def main() -> int:

@@ -209,6 +209,12 @@ def test_odd_tables_of_a_grid_are_refused(table: str, change: object, expected: 
         Network.from_tables(**tables)
 
 
+def test_one_of_two_like_columns_may_stand_alone() -> None:
+    tables = library.load("ieee14").to_tables()
+    alone = tables | {"buses": tables["buses"].drop(columns="g_shunt_pu")}
+    assert Network.from_tables(**alone).buses.b_shunt_pu.any()
+
+
 def test_tables_of_categories_make_the_same_grid() -> None:
     tables = library.load("ieee14").to_tables()
     coded = {name: frame.astype("category") for name, frame in tables.items()}

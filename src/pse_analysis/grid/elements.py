@@ -194,9 +194,10 @@ def check_spelling(table: str, given: Iterable[str], known: Iterable[str]) -> No
     GridError
         With both names; a column that resembles none is the user's own.
     """
-    given = [str(name) for name in given]
+    given, known = [str(name) for name in given], list(known)
     absent = [name for name in known if name not in given]
-    for column in given:
+    # b_shunt_pu without g_shunt_pu is no misspelling of it.
+    for column in (name for name in given if name not in known):
         word = column.strip().lower()
         for name in absent:
             first = name.split("_")[0]

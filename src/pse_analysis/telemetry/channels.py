@@ -18,6 +18,7 @@ from pse_analysis.vocabulary import (
     UNITS,
     Quantity,
     SigmaKind,
+    as_number,
     check,
     plain_columns,
     schema,
@@ -104,8 +105,7 @@ def _check_sigma(channels: pd.DataFrame) -> None:
     """Refuse a standard deviation that no sensor has; whether there is one says the schema."""
     if "sigma" not in channels.columns or "channel" not in channels.columns:
         return
-    with np.errstate(all="ignore"):
-        sigma = pd.to_numeric(channels["sigma"], errors="coerce").to_numpy(dtype=np.float64)
+    sigma = np.array([_number(cell) for cell in channels["sigma"]])
     bad = ~((sigma > 0) & np.isfinite(sigma))
     if bad.any():
         row = channels.loc[bad].iloc[0]
@@ -123,7 +123,9 @@ def _check_sigma(channels: pd.DataFrame) -> None:
         )
     if "sigma_kind" not in channels.columns:
         return
-    bad = (channels["sigma_kind"] == SigmaKind.RELATIVE).to_numpy(dtype=bool) & (sigma > 1.0)
+    kinds = channels["sigma_kind"]
+    relative = [isinstance(kind, str) and kind == SigmaKind.RELATIVE for kind in kinds]
+    bad = np.array(relative, dtype=bool) & (sigma > 1.0)
     if bad.any():
         row = channels.loc[bad].iloc[0]
         raise TableError(
@@ -131,6 +133,14 @@ def _check_sigma(channels: pd.DataFrame) -> None:
             f"expected at most 1, received {shown(row['sigma'])}; divide per cent by 100 (1 % is "
             "0.01), or write sigma_kind = 'absolute' if it is in the channel's unit"
         )
+
+
+def _number(cell: object) -> float:
+    """A cell as a number, NaN where it is none."""
+    try:
+        return as_number(cell)
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
 
 
 def suggest(name: str, names: Iterable[str]) -> str:
@@ -210,16 +220,18 @@ def check_shunts(telemetry: pd.DataFrame, channels: pd.DataFrame, network: Netwo
             with np.errstate(over="ignore"):
                 measured = max(float(-np.median(power) / buses.p_load_mw[i]), 0.0)
             share = (0.8 * measured, 1.25 * measured)
-        with np.errstate(over="ignore"):  # no load is near a shunt of infinite power
+        with np.errstate(all="ignore"):  # no load is near a shunt of infinite power
             square = np.square(np.median(voltage)) * network.base_mva
+            active, reactive = -buses.g_shunt_pu[i] * square, buses.b_shunt_pu[i] * square
         for quantity, nominal, shares, shunt, unit in (
-            (Quantity.P_MW, -buses.p_load_mw[i], (0, 1.5), -buses.g_shunt_pu[i] * square, "MW"),
-            (Quantity.Q_MVAR, -buses.q_load_mvar[i], share, buses.b_shunt_pu[i] * square, "Mvar"),
+            (Quantity.P_MW, -buses.p_load_mw[i], (0, 1.5), active, "MW"),
+            (Quantity.Q_MVAR, -buses.q_load_mvar[i], share, reactive, "Mvar"),
         ):
             for value in by_quantity.get(quantity, ()):
                 low, high = sorted(s * float(nominal) for s in shares)
-                plain = abs(value - np.clip(value, low, high))
-                with_shunt = abs(value - shunt - np.clip(value - shunt, low, high))
+                with np.errstate(all="ignore"):
+                    plain = abs(value - np.clip(value, low, high))
+                    with_shunt = abs(value - shunt - np.clip(value - shunt, low, high))
                 if with_shunt < 0.1 * abs(shunt) and plain > 0.5 * abs(shunt):
                     raise TableError(
                         f"telemetry: {quantity} at {element} has a median of {value:.4g} {unit}, "

@@ -161,7 +161,8 @@ def ingest(
 
 def _samples(frame: pd.DataFrame, columns: Mapping[str, str] | None) -> pd.DataFrame:
     """The user's table under this project's names, with plain columns and a plain index."""
-    if columns and isinstance(frame, pd.DataFrame):
+    plain_columns("telemetry", frame, ())
+    if columns:
         renamed = frame.rename(columns=dict(columns))
         twice = renamed.columns[renamed.columns.duplicated()].intersection(_KNOWN)
         if len(twice) and frame.columns.is_unique:
@@ -271,11 +272,15 @@ def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
     if "unit" in filled.columns:
         filled["unit"] = filled["unit"].astype(str).map(plain_unit).astype(object)
     if "quantity" in filled.columns:
-        filled.loc[filled["quantity"].isin(MAGNITUDES) & (filled["sign"] == -1), "sign"] = 1
+        magnitude = [isinstance(q, str) and q in MAGNITUDES for q in filled["quantity"]]
+        filled["sign"] = [
+            1 if undirected and _is(sign, -1) else sign
+            for undirected, sign in zip(magnitude, filled["sign"], strict=True)
+        ]
     for name in ("sigma", "lower", "upper", "period_s"):
         if name in filled.columns:
             filled[name] = _floats(filled[name])
-    wrong = ~filled["sign"].isin([-1, 1])
+    wrong = np.array([not (_is(sign, 1) or _is(sign, -1)) for sign in filled["sign"]], dtype=bool)
     if wrong.any() and "channel" in filled.columns:
         row = filled.loc[wrong].iloc[0]
         raise TableError(
@@ -297,6 +302,11 @@ def _floats(column: pd.Series) -> pd.Series:
         return column.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         return column
+
+
+def _is(cell: object, number: int) -> bool:
+    """Whether a cell of any kind is that number."""
+    return isinstance(cell, int | float | np.number) and bool(cell == number)
 
 
 def _reads_as_number(text: str) -> bool:
@@ -342,7 +352,10 @@ def _integers(
     if name not in frame.columns:
         return pd.array([None] * len(frame), dtype="Int64")
     try:
-        whole = frame[name].astype("Int64")
+        with np.errstate(
+            invalid="ignore"
+        ):  # infinity becomes no whole number, which pandas refuses
+            whole = frame[name].astype("Int64")
     except (TypeError, ValueError, OverflowError) as error:
         raise TableError(
             f"telemetry: column {name!r} must hold whole numbers, received {frame[name].dtype}, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Hashable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,6 +60,11 @@ def plain_columns(
             f"{table}: column names have {frame.columns.nlevels} levels, e.g. "
             f"{frame.columns[0] if len(frame.columns) else ()}; expected one: "
             "set frame.columns to plain names"
+        )
+    unnamed = [name for name in frame.columns if not isinstance(name, Hashable)]
+    if unnamed:
+        raise error(
+            f"{table}: {unnamed[0]!r} is no name of a column; expected texts: set frame.columns"
         )
     if not frame.columns.is_unique:
         twice = [name for name in frame.columns[frame.columns.duplicated()] if name in columns]
