@@ -96,6 +96,25 @@ def test_opening_the_only_path_makes_an_island() -> None:
     assert set(names[island != island[0]]) == {str(i) for i in range(7, 19)}
 
 
+def test_every_island_has_a_reference_and_the_slack_is_its_own() -> None:
+    network = library.load("ieee30").open_branch("6-8").open_branch("8-28")
+    assert network.references[network.slack] == network.slack
+    assert network.references[network.bus("8")] == network.bus("8")
+    assert set(network.references) == {network.slack, network.bus("8")}
+    network = library.load("ieee33").open_branch("6-7")
+    assert set(network.references) == {network.slack, network.bus("7")}  # nothing there generates
+
+
+def test_reference_of_an_island_is_its_largest_generator() -> None:
+    network = library.load("ieee14")
+    kind, generation = network.buses.kind.copy(), network.buses.p_gen_mw.copy()
+    kind[[9, 10]], generation[[9, 10]] = BusKind.PV, [5.0, 20.0]
+    network = changed(network, "buses", kind=kind, p_gen_mw=generation)
+    for name in ("4-9", "7-9", "9-14", "6-11"):
+        network = network.open_branch(name)
+    assert set(network.references) == {network.slack, 10}
+
+
 @pytest.mark.parametrize("grid", GRIDS)
 def test_current_of_equal_voltages_is_that_of_shunts_and_taps_alone(grid: str) -> None:
     network = library.load(grid)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +14,10 @@ from hypothesis import strategies as st
 from reference import GRIDS
 
 from pse_analysis.errors import GridError, NotConverged
-from pse_analysis.grid import BusKind, library
+from pse_analysis.grid import Branches, Buses, BusKind, Network, library
+from pse_analysis.grid.exchange import from_pandapower
 from pse_analysis.grid.power_flow import solve
+from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 
 SEED = 118
 
@@ -150,23 +155,137 @@ def test_limits_of_one_state_do_not_bind_another() -> None:
     assert (both.limited[:, 0] != both.limited[:, 1]).any()
 
 
-def test_base_power_changes_the_units_and_nothing_else() -> None:
-    network = library.load("ieee14")
-    factor = 37.0 / network.base_mva
-    b, bus = network.branches, network.buses
-    other = dataclasses.replace(
+def on_base(network: Network, base_mva: float) -> Network:
+    """The same grid in other units."""
+    factor = base_mva / network.base_mva
+    branch, bus = network.branches, network.buses
+    return dataclasses.replace(
         network,
-        base_mva=37.0,
+        base_mva=base_mva,
         branches=dataclasses.replace(
-            b, r_pu=b.r_pu * factor, x_pu=b.x_pu * factor, b_pu=b.b_pu / factor
+            branch,
+            r_pu=branch.r_pu * factor,
+            x_pu=branch.x_pu * factor,
+            b_pu=branch.b_pu / factor,
+            g_pu=branch.g_pu / factor,
         ),
         buses=dataclasses.replace(
             bus, g_shunt_pu=bus.g_shunt_pu / factor, b_shunt_pu=bus.b_shunt_pu / factor
         ),
     )
-    flow, same = solve(network), solve(other)
+
+
+@pytest.mark.parametrize("base_mva", [1e-3, 1.0, 10.0, 37.0, 100.0])
+@pytest.mark.parametrize("grid", [*GRIDS, "ieee57", "ieee300"])
+def test_base_power_changes_the_units_and_nothing_else(grid: str, base_mva: float) -> None:
+    network = library.load(grid)
+    flow, same = solve(network), solve(on_base(network, base_mva))
     np.testing.assert_allclose(same.x, flow.x, atol=1e-10)
-    np.testing.assert_allclose(same.p_pu * 37.0, flow.p_pu * network.base_mva, atol=1e-7)
+    gross = abs(network.y_bus).sum(axis=1) * network.base_mva
+    np.testing.assert_allclose(
+        same.p_pu * base_mva / gross, flow.p_pu * network.base_mva / gross, atol=1e-11
+    )
+
+
+def test_reactive_limits_bind_the_same_buses_on_any_base_power() -> None:
+    network = library.load("ieee118")
+    flow = solve(network, enforce_q_limits=True)
+    for base_mva in (1e-3, 1.0):
+        same = solve(on_base(network, base_mva), enforce_q_limits=True)
+        np.testing.assert_array_equal(same.limited, flow.limited)
+        np.testing.assert_allclose(same.x, flow.x, atol=1e-9)
+
+
+def test_grid_on_a_base_of_one_mva_converges_as_pandapower_does() -> None:
+    pandapower = pytest.importorskip("pandapower")
+    networks = pytest.importorskip("pandapower.networks")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        net = networks.create_cigre_network_hv()
+        pandapower.runpp(net, tolerance_mva=1e-9, numba=False)
+        network = from_pandapower(net, name="cigre_hv")
+    assert network.base_mva == 1.0
+    flow = solve(network)
+    assert flow.iterations <= 6
+    np.testing.assert_allclose(flow.vm, net.res_bus.vm_pu, atol=1e-9)
+    turned = np.exp(1j * (flow.theta - np.deg2rad(net.res_bus.va_degree.to_numpy())))
+    np.testing.assert_allclose(turned, 1.0, atol=1e-9)
+
+
+def test_dc_angles_start_what_a_flat_start_does_not() -> None:
+    """Phase shifters in the loops of ieee57: no flat start fits them all. 12 draws."""
+    network = library.load("ieee57")
+    flat = np.concatenate([np.zeros(57), np.ones(57)])
+    lost = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        some = rng.random(network.n_branch) < 0.2
+        shift = np.where(some, 0.26 * rng.normal(size=network.n_branch), 0.0)
+        turned = dataclasses.replace(
+            network, branches=dataclasses.replace(network.branches, shift_rad=shift)
+        )
+        flow = solve(turned)
+        others = np.arange(57) != network.slack
+        np.testing.assert_allclose(flow.p_pu[others], network.p_nominal_pu[others], atol=1e-9)
+        try:
+            solve(turned, start=flat, max_iterations=10)
+        except NotConverged:
+            lost += 1
+    assert lost >= 3
+
+
+def test_halved_steps_lead_where_full_steps_run_away() -> None:
+    """Newton's full steps, in textbook form, beside `solve` from starts far off. 40 draws."""
+    network = library.load("ieee14")
+    solution, n = solve(network).x, network.n_bus
+    angle, size = np.arange(1, n), np.flatnonzero(network.buses.kind == BusKind.PQ)
+    columns = np.concatenate([angle, n + size])
+    layout = SensorLayout.of(network, (P, angle, BUS), (Q, size, BUS))
+    model = MeasurementModel(network, layout, columns)
+    target = np.concatenate([network.p_nominal_pu[angle], network.q_nominal_pu[size]])
+    found = {"full": 0, "halved": 0}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        x = solution.copy()
+        x[angle] += 0.25 * rng.normal(size=n - 1)
+        x[n + size] += 0.08 * rng.normal(size=len(size))
+        with contextlib.suppress(NotConverged):
+            found["halved"] += np.abs(solve(network, start=x).x - solution).max() < 1e-9
+        for _ in range(30):
+            step = np.linalg.solve(model.jacobian(x).toarray(), model.h(x) - target)
+            x[columns] -= np.clip(step, -1e6, 1e6)
+        found["full"] += np.abs(x - solution).max() < 1e-9
+    assert found["halved"] >= 2 * found["full"] > 0
+
+
+def test_islands_with_references_of_their_own_are_grids_of_their_own() -> None:
+    """Two copies of ieee14 without a branch between them, one of which has no slack."""
+    one = library.load("ieee14")
+
+    def twice(table: Any) -> dict[str, Any]:
+        return {
+            f.name: np.concatenate([getattr(table, f.name)] * 2)
+            for f in dataclasses.fields(table)
+            if f.name != "name"
+        }
+
+    bus, branch = twice(one.buses), twice(one.branches)
+    bus["kind"][14] = BusKind.PV
+    branch["from_bus"][one.n_branch :] += 14
+    branch["to_bus"][one.n_branch :] += 14
+    two = Network(
+        "two",
+        one.base_mva,
+        Buses(name=tuple(str(i) for i in range(28)), **bus),
+        Branches(name=tuple(str(i) for i in range(2 * one.n_branch)), **branch),
+    )
+    assert set(two.references) == {0, 14}
+    with pytest.raises(GridError, match="14 buses have no path to the slack bus"):
+        solve(two)
+    flow, alone = solve(two, own_references=True), solve(one)
+    for half in (slice(0, 14), slice(14, 28)):
+        np.testing.assert_allclose(flow.theta[half], alone.theta, atol=1e-10)
+        np.testing.assert_allclose(flow.vm[half], alone.vm, atol=1e-10)
 
 
 @pytest.mark.parametrize("degrees", [30.0, 150.0, 180.0, -120.0])

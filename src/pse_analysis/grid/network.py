@@ -22,6 +22,7 @@ import pandas as pd
 from scipy import sparse
 
 from pse_analysis.errors import GridError
+from pse_analysis.grid import topology
 from pse_analysis.grid.elements import Branches, Buses, BusKind, freeze
 from pse_analysis.grid.plausibility import check_plausible
 from pse_analysis.grid.reading import read_tables
@@ -229,42 +230,20 @@ class Network:
 
     @cached_property
     def resting_angle_rad(self) -> FloatArray:
-        """Angles without load: what phase shifters turn a bus against the slack. (n_bus,) [rad]
+        """Angles without load: what phase shifters turn a bus. (n_bus,) [rad]
 
-        Along one tree of branches in service; around a loop shifts may disagree.
+        They count from the reference of its island; around a loop shifts may disagree.
         """
-        branch = self.branches
-        angle = np.zeros(self.n_bus)
-        turning = branch.in_service & (branch.shift_rad != 0)
-        if not turning.any():
-            return angle
-        # V_from = a e^{jφ} V_to without current.
-        shift = {}
-        for k in np.flatnonzero(branch.in_service):
-            begin, end = int(branch.from_bus[k]), int(branch.to_bus[k])
-            shift[begin, end], shift[end, begin] = -branch.shift_rad[k], branch.shift_rad[k]
-        order, before = sparse.csgraph.breadth_first_order(
-            self._connections, self.slack, directed=False
-        )
-        for bus in order[1:]:
-            angle[bus] = angle[before[bus]] + shift[int(before[bus]), int(bus)]
-        return angle
+        return topology.resting_angles(self)
 
     def islands(self) -> npt.NDArray[np.int32]:
         """Label of the connected component of each bus. (n_bus,)"""
-        return np.asarray(sparse.csgraph.connected_components(self._connections, directed=False)[1])
+        return topology.islands(self)
 
-    @property
-    def _connections(self) -> sparse.csr_array:
-        """Which buses the branches in service connect."""
-        closed = self.branches.in_service
-        return sparse.csr_array(
-            (
-                np.ones(int(closed.sum())),
-                (self.branches.from_bus[closed], self.branches.to_bus[closed]),
-            ),
-            shape=(self.n_bus, self.n_bus),
-        )
+    @cached_property
+    def references(self) -> IntArray:
+        """Bus that stands for the angle of each bus's island, the slack in its own. (n_bus,)"""
+        return topology.references(self)
 
     # ---------------------------------------------------------------------------------- tables
 

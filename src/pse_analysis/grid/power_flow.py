@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from pse_analysis.errors import GridError, NotConverged
+from pse_analysis.grid.dc import DcPowerFlow
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
+from pse_analysis.grid.newton import NewtonPowerFlow, rounding_pu
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
-_BLOCK = 64
-"""States solved in one block-diagonal factorisation; more gain nothing and cost memory."""
+_USUAL_ITERATIONS = 10
+"""Newton iterations that a flat start takes at most where it is any good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,7 @@ def solve(
     *,
     start: FloatArray | None = None,
     enforce_q_limits: bool = False,
+    own_references: bool = False,
     tolerance: float = 1e-10,
     max_iterations: int = 30,
 ) -> PowerFlow:
@@ -71,12 +73,18 @@ def solve(
     vm_set_pu : like p_pu, optional
         Voltage of slack and PV buses; nominal by default. [p.u.]
     start : (2 n_bus,) or (2 n_bus, n_state) ndarray, optional
-        [θ; |V|] to start from; by default flat, but for what phase shifters turn.
+        [θ; |V|] to start from; by default flat, but for what phase shifters turn, and with the
+        angles of DC power flow where that leads nowhere.
     enforce_q_limits : bool
         Turn PV buses whose generation leaves its reactive limits into PQ buses at the limit.
+    own_references : bool
+        Let a part of the grid without a path to the slack bus be held by a bus of its own
+        (`Network.references`) at its voltage set-point and angle zero.
     tolerance : float
-        Largest mismatch of a solved state. [p.u.]
+        Largest mismatch of a solved state; where a bus's power cannot be computed that well, as on
+        a small base power, what rounding leaves counts instead. [p.u.]
     max_iterations : int
+        Newton iterations from each start. A step that would raise the mismatch is halved.
 
     Returns
     -------
@@ -85,11 +93,13 @@ def solve(
     Raises
     ------
     GridError
-        If a part of the grid is not connected to the slack bus, or an injection is not finite.
+        If a part of the grid is not connected to the slack bus, unless ``own_references``, or an
+        injection is not finite.
     NotConverged
         With the state, the bus and the size of the worst mismatch.
     """
-    _require_one_island(network)
+    if not own_references:
+        _require_one_island(network)
     given = [
         np.asarray(default if value is None else value, dtype=float)
         for value, default in (
@@ -111,29 +121,28 @@ def solve(
                 f"{network.buses.name[bus]!r}, state {state}"
             )
     x = np.empty((2 * network.n_bus, p.shape[1]))
-    if start is None:
-        x[: network.n_bus] = network.resting_angle_rad[:, None]
-        x[network.n_bus :] = np.where((network.buses.kind == BusKind.PQ)[:, None], 1.0, vm_set)
-    else:
-        x[:] = start if np.ndim(start) == 2 else np.asarray(start)[:, None]
     held = np.broadcast_to((network.buses.kind == BusKind.PV)[:, None], p.shape).copy()
     limit = np.full(p.shape, np.nan)
     iterations = 0
     # Every pass solves the states whose set of voltage-controlled buses changed.
     pending = np.arange(p.shape[1])
-    for _ in range(network.n_bus + 1):
+    if start is not None:
+        x[:] = start if np.ndim(start) == 2 else np.asarray(start)[:, None]
+    for number in range(network.n_bus + 1):
         for pattern, states in _groups(held, pending):
-            target_q = np.where(np.isnan(limit[:, states]), q[:, states], limit[:, states])
-            x[:, states], used = _newton(
-                network,
-                pattern,
-                p[:, states],
-                target_q,
-                vm_set[:, states],
-                x[:, states],
+            cold = number == 0 and start is None
+            starts = (
+                _starts(network, p, vm_set, max_iterations)
+                if cold
+                else [(lambda some: x[:, some], max_iterations)]
+            )
+            x[:, states], used = _solve_from(
+                NewtonPowerFlow(network, pattern, tolerance),
+                starts,
                 states,
-                tolerance,
-                max_iterations,
+                p[:, states],
+                np.where(np.isnan(limit[:, states]), q[:, states], limit[:, states]),
+                vm_set[:, states],
             )
             iterations = max(iterations, used)
         if not enforce_q_limits:
@@ -167,8 +176,56 @@ def _require_one_island(network: Network) -> None:
         raise GridError(
             f"{network.name}: {len(names)} buses have no path to the slack bus "
             f"({', '.join(names[:5])}{', …' if len(names) > 5 else ''}): close a branch or drop "
-            "them"
+            "them, or give own_references=True"
         )
+
+
+def _solve_from(
+    newton: NewtonPowerFlow,
+    starts: Iterable[tuple[Callable[[IntArray], FloatArray], int]],
+    states: IntArray,
+    p: FloatArray,
+    q: FloatArray,
+    vm_set: FloatArray,
+) -> tuple[FloatArray, int]:
+    """Solve states, from the next start where one leads nowhere.
+
+    Raises
+    ------
+    NotConverged
+        If the last start leads nowhere either.
+    """
+    x, left, iterations = np.empty((2 * len(p), len(states))), np.arange(len(states)), 0
+    for start, most in starts:
+        found, used, failed, mismatch = newton.solve(
+            p[:, left], q[:, left], vm_set[:, left], start(states[left]), most
+        )
+        x[:, left], iterations, left = found, max(iterations, used), left[failed]
+        if not len(left):
+            return x, iterations
+    raise newton.complaint(mismatch, states[left], len(states), used)
+
+
+def _starts(
+    network: Network, p: FloatArray, vm_set: FloatArray, max_iterations: int
+) -> Iterator[tuple[Callable[[IntArray], FloatArray], int]]:
+    """Yields where to start some states from, and for how many iterations that is worth a try.
+
+    Flat goes nearly always; the angles of DC power flow help where angles are large.
+    """
+    size = np.where((network.buses.kind == BusKind.PQ)[:, None], 1.0, vm_set)
+    rest = np.broadcast_to(network.resting_angle_rad[:, None], p.shape)
+
+    def flat(states: IntArray) -> FloatArray:
+        return np.concatenate([rest[:, states], size[:, states]])
+
+    yield flat, min(max_iterations, _USUAL_ITERATIONS)
+    linear = DcPowerFlow(network)
+    yield (
+        lambda states: np.concatenate([linear.angles(p[:, states]), size[:, states]]),
+        max_iterations,
+    )
+    yield flat, max_iterations
 
 
 def _groups(
@@ -177,80 +234,6 @@ def _groups(
     """States that share one set of voltage-controlled buses."""
     patterns, member = np.unique(held[:, states], axis=1, return_inverse=True)
     return [(patterns[:, g], states[np.ravel(member) == g]) for g in range(patterns.shape[1])]
-
-
-def _newton(
-    network: Network,
-    held: npt.NDArray[np.bool_],
-    p: FloatArray,
-    q: FloatArray,
-    vm_set: FloatArray,
-    x: FloatArray,
-    states: npt.NDArray[np.int64],
-    tolerance: float,
-    max_iterations: int,
-) -> tuple[FloatArray, int]:
-    n = network.n_bus
-    free_angle = np.flatnonzero(np.arange(n) != network.slack)
-    free_size = np.flatnonzero((np.arange(n) != network.slack) & ~held)
-    model = MeasurementModel(
-        network,
-        SensorLayout.of(network, (P, free_angle, BUS), (Q, free_size, BUS)),
-        columns=np.concatenate([free_angle, n + free_size]),
-    )
-    target = np.concatenate([p[free_angle], q[free_size]])
-    fixed = np.setdiff1d(np.arange(n), free_size)
-    x = x.copy()
-    x[n + fixed] = vm_set[fixed]
-    x[network.slack] = 0.0
-    active = np.arange(x.shape[1])
-    with np.errstate(all="ignore"):  # a diverging state ends in NotConverged, not in warnings
-        for iteration in range(max_iterations + 1):
-            mismatch = model.h(x[:, active]) - target[:, active]
-            worst = np.abs(mismatch).max(axis=0, initial=0.0)
-            open_ = ~(worst <= tolerance)
-            active, mismatch = active[open_], mismatch[:, open_]
-            if not len(active):
-                return x, iteration
-            if iteration == max_iterations or not np.isfinite(mismatch).all():
-                break
-            for first in range(0, len(active), _BLOCK):
-                part = active[first : first + _BLOCK]
-                step = _block_solve(model, x[:, part], mismatch[:, first : first + _BLOCK])
-                if step is None:
-                    x[:, part] = np.nan
-                else:
-                    x[np.ix_(model.columns, part)] -= step
-    size = np.where(np.isfinite(mismatch), np.abs(mismatch), np.inf)
-    row, column = np.unravel_index(int(np.argmax(size)), size.shape)
-    kind = "P" if row < len(free_angle) else "Q"
-    bus = np.concatenate([free_angle, free_size])[row]
-    raise NotConverged(
-        f"power flow of {network.name} did not converge in {iteration} iterations: "
-        f"{len(active)} of {x.shape[1]} states are open, worst mismatch of {kind} "
-        f"{size[row, column]:.3g} p.u. at bus {network.buses.name[bus]!r} "
-        f"(state {states[active[column]]}): lower the load or start closer to the solution"
-    )
-
-
-def _block_solve(model: MeasurementModel, x: FloatArray, mismatch: FloatArray) -> FloatArray | None:
-    """Newton steps of several states by one factorisation of their block-diagonal Jacobian."""
-    data = model.jacobian_data(x)
-    if not np.isfinite(data).all():
-        return None
-    m, count = model.shape[0], x.shape[1]
-    nnz = data.shape[0]
-    # The CSR pattern read as CSC is the transpose, which SuperLU solves just as well.
-    indices = (model.indices[None, :] + m * np.arange(count)[:, None]).ravel()
-    indptr = (model.indptr[None, :-1] + nnz * np.arange(count)[:, None]).ravel()
-    transposed = sparse.csc_array(
-        (data.T.ravel(), indices, np.append(indptr, nnz * count)), shape=(m * count, m * count)
-    )
-    try:
-        factor = sparse_linalg.splu(transposed)
-    except RuntimeError:  # exactly singular
-        return None
-    return np.asarray(factor.solve(mismatch.T.ravel(), trans="T").reshape(count, m).T)
 
 
 def _injections(network: Network, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -277,10 +260,10 @@ def _switch(
     upper = (network.buses.q_max_mvar / network.base_mva)[:, None] + q_load
     lower = (network.buses.q_min_mvar / network.base_mva)[:, None] + q_load
     vm = x[network.n_bus :]
-    margin = 1e-9
+    margin = np.maximum(1e-9, rounding_pu(network, vm))
     over, under = held & (q > upper + margin), held & (q < lower - margin)
     released = controlled & ~held
-    back = released & np.where(limit >= upper - margin, vm > vm_set + margin, vm < vm_set - margin)
+    back = released & np.where(limit >= upper - margin, vm > vm_set + 1e-9, vm < vm_set - 1e-9)
     limit[over], limit[under] = upper[over], lower[under]
     limit[back] = np.nan
     held[over | under] = False
