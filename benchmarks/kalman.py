@@ -172,7 +172,7 @@ def textbook(
         share = intervals.weights(*interval) if lags else np.ones((len(on), 1))
         bridge = intervals.bridge_covariance(*interval) if lags else 0.0
         for _ in range(3):
-            H, z, spread = model.rows(now.z, now.sigma, on, voltage)
+            H, z, spread = model.rows(now.z, now.sigma, on, voltage, "derivative")
             H = H.toarray()
             R = np.diag(spread**2) + bridge * (H @ walk @ H.T)
             H = np.hstack([share[:, [lag]] * H for lag in range(blocks)])

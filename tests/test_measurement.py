@@ -245,6 +245,52 @@ def test_linear_rows_have_the_slope_and_the_spread_of_the_measurement(lost: int 
     assert np.abs(correlation - np.eye(int(sound.sum()))).max() < 4.8 / np.sqrt(draws)
 
 
+@pytest.mark.parametrize("grid", ["ieee14", "ieee33"])
+def test_linear_rows_have_the_whole_derivative(grid: str) -> None:
+    """A row is a measured value over |V|, or an angle times |c|; Q lies along the conjugate."""
+    network = harder(grid)
+    layout = phasors_and_powers(network)
+    x = random_state(network, np.random.default_rng(SEED))
+    n, sigma = network.n_bus, np.full(len(layout), 0.01)
+    voltage = x[n:] * np.exp(1j * x[:n])
+    state = np.concatenate([voltage.real, voltage.imag])
+
+    def read(s: np.ndarray) -> np.ndarray:
+        at = s[:n] + 1j * s[n:]
+        return measured(network, layout, np.concatenate([np.angle(at), np.abs(at)]))
+
+    model, on = RectangularModel(network, layout), np.ones(len(layout), dtype=bool)
+    H, target, spread = model.rows(read(state), sigma, on, voltage, "derivative")
+    np.testing.assert_allclose(H @ state, target, atol=1e-9)
+    scale = np.where(layout.quantity == Q, -1.0, 1.0) * spread / sigma
+    rows = scale[:, None] * central_differences(read, state)
+    np.testing.assert_allclose(H.toarray(), rows, rtol=1e-5, atol=1e-5)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.integers(0, 2**32 - 1))
+def test_powers_and_magnitudes_do_not_see_a_common_rotation(seed: int) -> None:
+    network = library.load("ieee14")
+    bus, branch = np.arange(network.n_bus), np.arange(network.n_branch)
+    layout = SensorLayout.of(
+        network,
+        (VM, bus, BUS), (P, bus, BUS), (Q, bus, BUS),
+        (P, branch, FROM), (Q, branch, FROM), (P, branch, TO), (Q, branch, TO),
+    )  # fmt: skip
+    x = random_state(network, np.random.default_rng(seed))
+    voltage = x[14:] * np.exp(1j * x[:14])
+    z, on = np.zeros(len(layout)), np.ones(len(layout), dtype=bool)
+    rotation = np.concatenate([-voltage.imag, voltage.real])
+    model, sigma = RectangularModel(network, layout), np.full(len(z), 0.01)
+    H = model.rows(z, sigma, on, voltage, "derivative")[0]
+    assert np.abs(H @ rotation).max() < 1e-12 * np.abs(H).max()
+    # The information H'R⁻¹H of every other direction is left.
+    value = np.linalg.eigvalsh((H.T @ H).toarray())
+    assert np.count_nonzero(value < 1e-12 * value[-1]) == 1
+    seen = model.rows(z, sigma, on, voltage, "transform")[0] @ rotation
+    assert np.abs(seen).max() > 0.01
+
+
 # --- units ----------------------------------------------------------------------------------------
 
 UNIT_ROWS = [

@@ -25,15 +25,65 @@ from pse_analysis.measurement import (
     RectangularModel,
     SensorLayout,
 )
+from pse_analysis.measurement.rectangular import Linearisation
 
 SEED = 5
 STEP_S = 300.0
 
 
+def rows_about(
+    at: np.ndarray, share: np.ndarray, now: Snapshot, used: np.ndarray, linear: RectangularModel
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every row by itself, about the mean voltages of its own interval."""
+    n, on = at.shape[1] // 2, now.available & now.fresh
+    found = []
+    for row, weight in zip(used, share, strict=True):
+        mean = weight @ at
+        H, z, spread = linear.rows(now.z, now.sigma, on, mean[:n] + 1j * mean[n:], "derivative")
+        found.append((H.toarray()[row], z[row], spread[row]))
+    return tuple(np.array(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
+
+
+def transformed(
+    at: np.ndarray, now: Snapshot, used: np.ndarray, linear: RectangularModel
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All rows, in frames of one voltage."""
+    n = len(at) // 2
+    H, z, spread = linear.rows(
+        now.z, now.sigma, now.available & now.fresh, at[:n] + 1j * at[n:], "transform"
+    )
+    return H.toarray()[used], z[used], spread[used]
+
+
+def varied(
+    forecast: np.ndarray, at: np.ndarray, share: np.ndarray, model: MeasurementModel,
+    used: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """By how much the mean of a power is not the power of the mean, over |V| of the meter."""
+    before, n = forecast.reshape(at.shape), at.shape[1] // 2
+
+    def power(state: np.ndarray) -> np.ndarray:
+        voltage = state[:n] + 1j * state[n:]
+        return model.h(np.concatenate([np.angle(voltage), np.abs(voltage)]))
+
+    out = np.zeros(len(used))
+    each = np.array([power(state) for state in before])
+    for k, (row, weight) in enumerate(zip(used, share, strict=True)):
+        quantity, bus = model.layout.quantity[row], model.layout.position[row]
+        if quantity in (P, Q):
+            mean = weight @ at
+            apart = weight @ each[:, row] - power(weight @ before)[row]
+            out[k] = (-apart if quantity == Q else apart) / abs(mean[bus] + 1j * mean[n + bus])
+    return out
+
+
+@pytest.mark.parametrize("linearisation", ["derivative", "transform"])
 @pytest.mark.parametrize(
     "process", [random_walk(), holt(), local_trend()], ids=["walk", "holt", "trend"]
 )
-def test_lagged_filter_equals_augmented_textbook_filter(process: Process) -> None:
+def test_lagged_filter_equals_augmented_textbook_filter(
+    process: Process, linearisation: Linearisation
+) -> None:
     """The textbook's state keeps one instant more: it holds what it reads while it updates."""
     network = library.load("ieee14")
     n, bus = network.n_bus, np.arange(network.n_bus)
@@ -49,13 +99,16 @@ def test_lagged_filter_equals_augmented_textbook_filter(process: Process) -> Non
     noise = load_noise(network, statistics)
     lags = 4
     ours = kalman_filter(
-        "kf", network, layout, noise, step_s=STEP_S, reach_s=1200.0, process=process
-    )
+        "kf", network, layout, noise, step_s=STEP_S, reach_s=1200.0, process=process,
+        linearisation=linearisation,
+    )  # fmt: skip
     wide = kalman_filter(
-        "kf", network, layout, noise, step_s=STEP_S, reach_s=1500.0, process=process
-    )
+        "kf", network, layout, noise, step_s=STEP_S, reach_s=1500.0, process=process,
+        linearisation=linearisation,
+    )  # fmt: skip
     linear = RectangularModel(network, layout)
-    exact = MeasurementModel(network, layout).h(solve(network).x)
+    model = MeasurementModel(network, layout)
+    exact = model.h(solve(network).x)
     rng = np.random.default_rng(SEED)
 
     def snapshot(k: int) -> Snapshot:
@@ -89,29 +142,32 @@ def test_lagged_filter_equals_augmented_textbook_filter(process: Process) -> Non
         )
         offset = np.zeros(size)
         offset[present] = ahead - (F @ x)[present]
-        voltage = ahead[:n] + 1j * ahead[n : 2 * n]
+        forecast = F @ x + offset
         walk = np.zeros((size, size))
-        walk[np.ix_(present, present)] = process.noise(noise(voltage, now.time))
+        walk[np.ix_(present, present)] = process.noise(noise(ahead[:n] + 1j * ahead[n:m], now.time))
         used = np.flatnonzero(now.available & now.fresh)
         interval = now.age_s[used], layout.window_s[used], STEP_S, lags
         share, bridge = weights(*interval), bridge_covariance(*interval)
-        for _ in range(3):
-            H, z, spread = linear.rows(now.z, sigma, now.available & now.fresh, voltage)
-            H = H.toarray()[used]
-            slopes = np.zeros((len(used), m * (order - 1)))
-            lagged = np.hstack([*(share[:, [lag]] * H for lag in range(lags + 1)), slopes])
-            R = np.diag(spread[used] ** 2) + bridge * (H @ walk[:m, :m] @ H.T)
-            moved = z[used] - lagged @ offset
-            after = kalman_step(x, covariance, F, walk, lagged, R, moved)
-            after = after[0] + offset, after[1]
-            reached = after[0][:n] + 1j * after[0][n : 2 * n]
-            settled = np.abs(reached - voltage).max() < 1e-3
-            voltage = reached
-            if settled:
-                break
-        x, covariance = after
         state, info = ours.step(state, now)
         assert info.used.sum() == len(used)
+        about, oldest = forecast, forecast[m * lags : m * (lags + 1)]
+        for _ in range(info.iterations):
+            at = about[: m * (lags + 1)].reshape(lags + 1, m)
+            H, z, spread = (
+                rows_about(at, share, now, used, linear)
+                if linearisation == "derivative"
+                else transformed(at[0], now, used, linear)
+            )
+            if linearisation == "derivative":
+                z = z - varied(forecast[: m * (lags + 1)], at, share, model, used)
+            slopes = np.zeros((len(used), m * (order - 1)))
+            lagged = np.hstack([*(share[:, [lag]] * H for lag in range(lags + 1)), slopes])
+            R = np.diag(spread**2) + bridge * (H @ walk[:m, :m] @ H.T)
+            after = kalman_step(x, covariance, F, walk, lagged, R, z - lagged @ offset)
+            about = after[0] + offset
+            # What is forgotten after the step is not told of either.
+            about[m * lags : m * (lags + 1)] = oldest
+        x, covariance = after[0] + offset, after[1]
         np.testing.assert_allclose(state.x, x[kept], rtol=1e-9, atol=1e-11)
         deviation = np.sqrt(np.maximum(np.diagonal(covariance)[kept], 1e-20))
         difference = (state.P - covariance[np.ix_(kept, kept)]) / np.outer(deviation, deviation)

@@ -9,7 +9,7 @@ import pytest
 from qu_bench import VARIANCE, Bench, real_day, still
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import conditioning, gaussian, holt, noise, unscented
+from pse_analysis.estimation import factors, gaussian, holt, noise, unscented
 from pse_analysis.estimation.composition import Composition, build, scalar
 from pse_analysis.estimation.conditioning import Prior
 from pse_analysis.estimation.driver import run
@@ -56,7 +56,7 @@ def test_moments_equal_the_weighted_sums(order: int, alpha: float, beta: float) 
     apart = y - mean[:, None]
     np.testing.assert_allclose(found.mean, mean, atol=1e-10)
     own = (weight * apart) @ apart.T
-    np.testing.assert_allclose(conditioning.symmetric(found.own), own, atol=1e-10)
+    np.testing.assert_allclose(factors.symmetric(found.own), own, atol=1e-10)
     cross = (weight * (points - prior.s[:, None])) @ apart.T
     np.testing.assert_allclose(found.cross, cross, atol=1e-10)
 
@@ -173,7 +173,7 @@ def test_alpha_by_likelihood_is_the_likeliest() -> None:
         found = unscented.fixed(model, Scaling(alpha)).predict(
             prior, snapshot, rows, alpha, prior.s
         )
-        S = conditioning.symmetric(found.own) + np.diag(snapshot.sigma**2)
+        S = factors.symmetric(found.own) + np.diag(snapshot.sigma**2)
         eta = snapshot.z - found.mean
         return float(-eta @ np.linalg.solve(S, eta) - np.linalg.slogdet(S)[1])
 

@@ -31,6 +31,7 @@ from pse_analysis.estimation.wls import state_columns
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.measurement import BUS, Model, P, Q, SensorLayout
+from pse_analysis.measurement.rectangular import Linearisation
 from pse_analysis.parameters import Study
 from pse_analysis.validation.adaptive import AdaptiveParams
 from pse_analysis.vocabulary import Status, check
@@ -58,7 +59,7 @@ class Method:
     name : str
         Spelling in tables and figures.
     filter : {"wls", "kalman", "ukf", "ekf", "observer"}
-        ``observer`` is a machine's, the others are a grid's. ``kalman`` is linear in rectangular
+        ``observer`` is a machine's, the others are a grid's. ``kalman`` has rectangular
         coordinates, ``ukf`` and ``ekf`` are polar.
     noise : {"load", "scalar", "innovation"}
         Process noise of a filter: loads as history moved them, q I, or, in a ``kalman`` filter,
@@ -75,6 +76,10 @@ class Method:
     reading : {"interval", "instant"}
         Whether a ``kalman`` filter reads a sample over the interval that it covers, once, or as a
         value of the present instant, as often as it stands there.
+    linearisation : {"derivative", "transform"}
+        Whether a ``kalman`` filter follows the whole derivative of a power, or reads it as a
+        current that is fixed in the frame of the predicted voltage, as [qi2025] does. The latter
+        claims to know the angle that all buses share, which powers do not tell.
     screening : {"none", "literal", "absolute", "scaled", "innovation"}
         How gross errors are met: by an adaptive threshold before any filter, or, in a ``kalman``
         filter, by its own innovation.
@@ -90,6 +95,7 @@ class Method:
     compose: Composition = field(default_factory=Composition)
     observer: machine.ObserverParams | None = None
     reading: Literal["interval", "instant"] = "interval"
+    linearisation: Linearisation = "derivative"
     screening: Literal["none", "literal", "absolute", "scaled", "innovation"] = "none"
     variant: str = "last"
 
@@ -202,6 +208,7 @@ def _build_plain(
         instant=method.reading == "instant",
         refuse=_refuse(method) if method.screening == "innovation" else None,
         process=composition.process_of(method.compose),
+        linearisation=method.linearisation,
     )
 
 

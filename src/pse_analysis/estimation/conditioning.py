@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas
 
-from pse_analysis.estimation.factors import Root, cholesky, factor, solve, symmetric
+from pse_analysis.estimation.factors import Root, cholesky, factor, solve
 from pse_analysis.estimation.robust import Suspicion
 
 FloatArray = npt.NDArray[np.float64]
@@ -158,32 +158,39 @@ class Moments(NamedTuple):
         With S = L Lᵀ and X = C L⁻ᵀ: K η = X (L⁻¹η) and P - K S Kᵀ = P - X Xᵀ, a symmetric product.
         Noise added to few rows F makes that P - X Xᵀ + Z Zᵀ, Z = X Y, see `_relaxation`.
         """
-        variance = np.diagonal(self.own) + noise
-        solved = _Solved(self, factor(self.own, variance))
-        white = solve(solved.chol_S, innovation)
+        solved = self.solved(innovation, noise)
+        variance, white = solved.variance, solved.white
         inflation, relaxed = np.zeros(len(noise)), None
         if verdict is not None:
             root = Root(solved.chol_S, self._known(solved, prior, noise))
             inflation = verdict(Suspicion(innovation, variance, noise, white, root))
         wrong = np.flatnonzero(inflation)
         if FEW * len(wrong) > len(noise):
-            solved = _Solved(self, factor(self.own, variance + inflation * noise))
-            white = solve(solved.chol_S, innovation)
+            solved = self.solved(innovation, noise + inflation * noise)
+            white = solved.white
         nis = float(white @ white)
         if 0 < FEW * len(wrong) <= len(noise):
             relaxed = _relaxation(root.columns(wrong), (inflation * noise)[wrong])
             through = white @ relaxed
             white = white - relaxed @ through
             nis -= float(through @ through)
-        # P is symmetric, so that its transpose is itself in the order that BLAS reads.
-        lower = blas.dsyrk(-1.0, solved.X, beta=1.0, c=prior.P.T, lower=1)
-        if relaxed is not None:
-            lost = blas.dgemm(1.0, solved.X, relaxed)
-            lower = blas.dsyrk(1.0, lost, beta=1.0, c=lower, lower=1, overwrite_c=1)
-        return Posterior(prior.s + solved.X @ white, symmetric(lower), variance, inflation, nis)
+        s, P = prior.s + solved.X @ white, solved.reduced(prior.P, relaxed)
+        return Posterior(s, P, variance, inflation, nis)
+
+    def solved(self, innovation: FloatArray, noise: FloatArray) -> Solved:
+        """S of an innovation with the diagonal of R, factorised.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If S is not positive definite.
+        """
+        variance = np.diagonal(self.own) + noise
+        chol_S = factor(self.own, variance)
+        return Solved(chol_S, solve(chol_S, innovation), variance, self.cross)
 
     def _known(
-        self, solved: _Solved, prior: Prior, noise: FloatArray
+        self, solved: Solved, prior: Prior, noise: FloatArray
     ) -> Callable[[], FloatArray] | None:
         """Diagonal of S⁻¹ for measurements that read an entry of s.
 
@@ -202,16 +209,54 @@ class Moments(NamedTuple):
         return known
 
 
-class _Solved:
-    """L of S = L Lᵀ, and X = C L⁻ᵀ once it is asked for."""
+class Solved:
+    """An innovation η with its covariance S = L Lᵀ, and what it says about a state.
 
-    def __init__(self, moments: Moments, chol_S: FloatArray) -> None:
-        self.chol_S = chol_S
-        self._cross = moments.cross
+    Parameters
+    ----------
+    chol_S : (m, m) ndarray
+        L; what stands above the diagonal does not count.
+    white : (m,) ndarray
+        L⁻¹ η.
+    variance : (m,) ndarray
+        S_ii.
+    cross : (N, m) ndarray
+        C, covariance of the state and the measurements.
+    """
+
+    def __init__(
+        self, chol_S: FloatArray, white: FloatArray, variance: FloatArray, cross: FloatArray
+    ) -> None:
+        self.chol_S, self.white, self.variance = chol_S, white, variance
+        self._cross = cross
+
+    @property
+    def nis(self) -> float:
+        """ηᵀS⁻¹η."""
+        return float(self.white @ self.white)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """√S_ii. (m,)"""
+        return np.asarray(np.sqrt(self.variance))
 
     @cached_property
     def X(self) -> FloatArray:
+        """C L⁻ᵀ. (N, m)"""
         return np.asarray(blas.dtrsm(1.0, self.chol_S, self._cross, side=1, lower=1, trans_a=1))
+
+    def correction(self) -> FloatArray:
+        """K η = C S⁻¹ η, without X. (N,)"""
+        return np.asarray(self._cross @ blas.dtrsv(self.chol_S, self.white, lower=1, trans=1))
+
+    def reduced(self, P: FloatArray, relaxed: FloatArray | None = None) -> FloatArray:
+        """P - X Xᵀ + Z Zᵀ with Z = X Y of `_relaxation`. (N, N)"""
+        # A product with its own transpose is exactly symmetric.
+        left = P - self.X @ self.X.T
+        if relaxed is not None:
+            lost = blas.dgemm(1.0, self.X, relaxed)
+            left += lost @ lost.T
+        return np.asarray(left)
 
 
 def _relaxation(V: FloatArray, added: FloatArray) -> FloatArray:

@@ -114,8 +114,7 @@ def _solve(chol: FloatArray, right: FloatArray, transposed: int) -> FloatArray:
 def _triangle(chol: FloatArray) -> FloatArray:
     """Inverse of a lower triangle. (m, m)"""
     found, _ = lapack.dtrtri(chol.copy(order="F"), lower=1, overwrite_c=1)
-    np.copyto(found, 0.0, where=_above(len(found)))
-    return np.asarray(found)
+    return cleaned(np.asarray(found))
 
 
 def _squares(matrix: FloatArray) -> FloatArray:
@@ -180,6 +179,12 @@ def symmetric(lower: FloatArray) -> FloatArray:
     out = lower.copy(order="C")
     np.copyto(out, lower.T, where=_above(len(lower)))
     return out
+
+
+def cleaned(chol: FloatArray) -> FloatArray:
+    """A lower triangle with zeros above its diagonal, in its place."""
+    np.copyto(chol, 0.0, where=_above(len(chol)))
+    return chol
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Kalman filter on the linear rectangular model, with the recent past in its state.
+"""Kalman filter in rectangular coordinates, with the recent past in its state.
 
 A sample is rarely taken at the instant it is used at: a meter reports the mean of the last quarter
 of an hour, SCADA arrives some seconds late. The filter therefore keeps the states of the last
@@ -14,24 +14,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.estimation import holt, intervals
+from pse_analysis.estimation import holt, intervals, matching
+from pse_analysis.estimation.conditioning import Solved
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
-from pse_analysis.estimation.lagged import Belief, Functionals, Lagged, Reach
+from pse_analysis.estimation.factors import cleaned
+from pse_analysis.estimation.lagged import Belief, Lagged, Reach, Rows
 from pse_analysis.estimation.matching import Matched, Matching
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
-from pse_analysis.estimation.readings import (
-    Readings,
-    conditioned,
-    gained,
-    innovation_of,
-    responses,
-)
 from pse_analysis.estimation.refusal import Refuse
+from pse_analysis.estimation.row_moments import Expansion, RowMoments
 from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import RectangularModel, SensorLayout
-from pse_analysis.measurement.rectangular import Memo
+from pse_analysis.measurement.rectangular import Linearisation, Memo
 from pse_analysis.vocabulary import Reason, Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,8 +35,6 @@ ComplexArray = npt.NDArray[np.complex128]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-REFINE_PU = 1e-3
-"""The measurements are transformed again if an update moves a voltage by more than this. [p.u.]"""
 MAX_PASSES = 3
 
 
@@ -81,21 +75,18 @@ class KalmanFilter:
         instant: bool,
         refuse: Refuse | None,
         process: holt.Process,
+        linearisation: Linearisation,
     ) -> None:
         self.n_bus, self.layout = network.n_bus, layout
         self.step_s, self.instant, self.refuse = step_s, instant, refuse
+        self.linearisation = linearisation
         self.model = RectangularModel(network, layout)
         self.lagged = Lagged(2 * network.n_bus, lags, process)
         self._noise = noise
         # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
         self._held = None if layout.has_angle else network.n_bus + network.slack
-        self._first = np.where(
-            self.model.partner >= 0,
-            np.minimum(self.model.partner, np.arange(len(layout))),
-            np.arange(len(layout)),
-        )
         # The same channels report again and again, often at the same age.
-        self._functionals: Memo[Functionals] = Memo()
+        self._rows: Memo[Rows] = Memo()
         self._reaches: Memo[Reach] = Memo()
 
     def walk(
@@ -139,41 +130,28 @@ class KalmanFilter:
         noise = self.lagged.process.noise(walk)
         prior = self.lagged.moved(belief, forecast, noise)
         used, sigma = self._usable(snapshot)
-        if not used.any():
-            return KalmanState(*prior, state.noise), Info.nothing(m, Status.PREDICTED)
-        rows = np.flatnonzero(used)
-        readings = self._read(belief, prior, noise, snapshot, rows)
-        frame = self.model.frame(snapshot.z, sigma, used, rows)
-        at = self.voltage(prior.x)
-        full = np.full((2, m), np.nan)
-        refused = np.zeros(m, dtype=bool)
+        told, refused = np.full((2, m), np.nan), np.zeros(m, dtype=bool)
+        given = belief, prior, noise, snapshot, sigma
         try:
-            turn, z, spread = frame.at(at)
-            innovation = innovation_of(readings, turn, z, spread)
-            if self.refuse is not None:
-                out = self.refuse(innovation.eta, innovation.chol_S, spread)
-                if out.any():
-                    full[0, rows], full[1, rows] = innovation.eta, innovation.sigma
-                    full[:, rows[~out]] = np.nan
-                    refused[rows[out]] = True
-                    used = used & ~refused
-                    rows, readings = rows[~out], readings._replace(group=readings.group[~out])
-                    if not len(rows):
-                        return KalmanState(*prior, state.noise), replace(
-                            Info.nothing(m, Status.PREDICTED),
-                            innovation=full[0],
-                            sigma_innovation=full[1],
-                            reasons=_refusals(refused),
-                        )
-                    frame = self.model.frame(snapshot.z, sigma, used, rows)
-                    innovation = innovation_of(readings, *frame.at(at))
-            for passes in range(1, MAX_PASSES + 1):
-                x = prior.x + gained(readings, innovation)
-                after = self.voltage(x)
-                if passes == MAX_PASSES or np.abs(after - at).max() < REFINE_PU:
-                    break
-                at = after
-                innovation = innovation_of(readings, *frame.at(at))
+            if used.any():
+                reading = self._reading(*given, used)
+                first = self._expanded(reading)
+                refused[used] = self._refuses(*first)
+            if refused.any():
+                told[:, refused] = first[0].eta[refused[used]], first[1].sigma[refused[used]]
+                used = used & ~refused
+                if used.any():
+                    reading = self._reading(*given, used)
+                    first = self._expanded(reading)
+            if not used.any():
+                return KalmanState(*prior, state.noise), replace(
+                    Info.nothing(m, Status.PREDICTED),
+                    innovation=told[0],
+                    sigma_innovation=told[1],
+                    reasons=_refusals(refused),
+                )
+            x, found, solved, passes = self._corrected(prior.x, reading, *first)
+            P = solved.reduced(prior.P)
         except np.linalg.LinAlgError:
             return None, Info.nothing(
                 m,
@@ -181,23 +159,48 @@ class KalmanFilter:
                 "the innovation's covariance is not positive definite: the filter starts "
                 "again from least squares",
             )
-        full[0, rows], full[1, rows] = innovation.eta, innovation.sigma
+        told[:, used] = found.eta, solved.sigma
         learnt = state.noise
         if isinstance(self._noise, Matching) and learnt is not None:
-            response = responses(shapes, readings, innovation)
-            learnt = self._noise.learn(learnt, response, innovation.white)
-        P = conditioned(prior.P, readings, innovation)
+            moving = 1.0 if found.reach is None else found.reach.moving
+            response = matching.responses(shapes, found.plane, moving, solved.chol_S)
+            learnt = self._noise.learn(learnt, response, solved.white)
         return KalmanState(x, P, prior.memory, learnt), Info(
             Status.OK,
             passes,
-            float(innovation.white @ innovation.white),
-            len(rows),
+            solved.nis,
+            len(solved.white),
             used,
-            full[0],
-            full[1],
+            told[0],
+            told[1],
             np.zeros(m),
             reasons=_refusals(refused),
         )
+
+    def _expanded(
+        self, reading: RowMoments, instants: ComplexArray | None = None
+    ) -> tuple[Expansion, Solved]:
+        """The rows about the forecast or other voltages, and their innovation."""
+        found = reading.at(reading.instants if instants is None else instants)
+        return found, found.moments.solved(found.eta, found.linear.spread**2)
+
+    def _refuses(self, found: Expansion, solved: Solved) -> BoolArray:
+        """Which rows contradict the others and the forecast. (r,)"""
+        if self.refuse is None:
+            return np.zeros(len(found.eta), dtype=bool)
+        return self.refuse(found.eta, cleaned(solved.chol_S), found.linear.spread)
+
+    def _corrected(
+        self, x: FloatArray, reading: RowMoments, found: Expansion, solved: Solved
+    ) -> tuple[FloatArray, Expansion, Solved, int]:
+        """A forecast corrected by rows, which are renewed where it moves far."""
+        for passes in range(1, MAX_PASSES + 1):
+            after = x + solved.correction()
+            instants = self.lagged.revised(reading.instants, after)
+            if passes == MAX_PASSES or reading.settled(found, instants):
+                break
+            found, solved = self._expanded(reading, instants)
+        return after, found, solved, passes
 
     def _usable(self, snapshot: Snapshot) -> tuple[BoolArray, FloatArray]:
         """Rows that are used, and their σ."""
@@ -208,37 +211,24 @@ class KalmanFilter:
         )
         return snapshot.available & snapshot.fresh & near, snapshot.sigma_own
 
-    def _read(
+    def _reading(
         self,
         belief: Belief,
         prior: Belief,
         noise: FloatArray,
         snapshot: Snapshot,
-        rows: IntArray,
-    ) -> Readings:
-        """Moments of what some rows of a snapshot read."""
-        first = self._first[rows]
-        age, window = snapshot.age_s, self.layout.window_s
-        if not self.instant:
-            alike = (age[first] == age[rows]) & (window[first] == window[rows])
-            first = np.where(alike, first, rows)
-        wanted = np.zeros(len(self.layout), dtype=bool)
-        wanted[first] = True
-        number = np.cumsum(wanted) - 1
-        key = wanted.tobytes()
-        functionals = self._functionals.get(
-            key, lambda: Functionals(self.model.functionals[wanted])
-        )
+        sigma: FloatArray,
+        used: BoolArray,
+    ) -> RowMoments:
+        """What the used rows of a snapshot read."""
+        at, key = np.flatnonzero(used), used.tobytes()
+        frame = self.model.frame(snapshot.z, sigma, used, at)
+        rows = self._rows.get(key, lambda: Rows(frame.pattern))
         reach: Reach | None = None
-        moving: FloatArray | float = 1.0
         if not self.instant:
-            ages = age[wanted]
-            reach = self._reaches.get(
-                key + ages.tobytes(), lambda: self._reach(ages, window[wanted])
-            )
-            moving = reach.moving
-        expected = self.lagged.expect(belief, prior, noise, functionals, reach)
-        return Readings(number[first], expected, functionals.plane, moving)
+            ages, windows = snapshot.age_s[at], self.layout.window_s[at]
+            reach = self._reaches.get(key + ages.tobytes(), lambda: self._reach(ages, windows))
+        return RowMoments(self.lagged, belief, prior, noise, rows, frame, reach, self.linearisation)
 
     def _reach(self, age_s: FloatArray, window_s: FloatArray) -> Reach:
         ages, windows, kind = intervals.kinds(age_s, window_s)
@@ -258,8 +248,9 @@ def kalman_filter(
     instant: bool = False,
     refuse: Refuse | None = None,
     process: holt.Process | None = None,
+    linearisation: Linearisation = "derivative",
 ) -> Estimator:
-    """Kalman filter on the linear rectangular model.
+    """Kalman filter in rectangular coordinates.
 
     Parameters
     ----------
@@ -283,6 +274,9 @@ def kalman_filter(
         in the info with their innovation.
     process : Process, optional
         How the mean moves; F = I if not given.
+    linearisation : {"derivative", "transform"}
+        Whether the rows of powers have the whole derivative, or are the currents of [qi2025], which
+        claim to know the angle that all buses share; see `RectangularModel`.
 
     Returns
     -------
@@ -292,10 +286,9 @@ def kalman_filter(
 
     Notes
     -----
-    Eqs. (25)–(29) of [qi2025] with constant H where all samples are instantaneous and of
-    age 0. Functionals of the state are constant, and a predicted voltage only turns and scales the
-    rows in which they are read: their covariance is made once per step, however often the
-    measurements are transformed again.
+    With ``transform``, eqs. (25)–(29) of [qi2025] where all samples are instantaneous and of age 0.
+    With ``derivative`` it is the extended Kalman filter of the same measurements, iterated where
+    the remainder of an expansion matters.
     """
     lags = 0 if instant else int(np.ceil(reach_s / step_s - 1e-9))
     made = KalmanFilter(
@@ -307,6 +300,7 @@ def kalman_filter(
         instant=instant,
         refuse=refuse,
         process=process or holt.random_walk(),
+        linearisation=linearisation,
     )
     wls = WeightedLeastSquares(network, layout)
     n = network.n_bus

@@ -1,4 +1,4 @@
-"""A grid's state with its recent past: how it moves, and what functionals of it are expected.
+"""A grid's state with its recent past: how it moves, and the moments of rows that read it.
 
 A state is B blocks of n numbers: [e; f] now, one step ago, …, L-1 steps ago, and behind them what
 a process adds to the present (the slopes of a trend). When it moves, the present becomes the first
@@ -15,10 +15,9 @@ import numpy.typing as npt
 from scipy import sparse
 
 from pse_analysis.estimation.holt import Process
-from pse_analysis.measurement.rectangular import Memo
+from pse_analysis.measurement.rectangular import Linear, Memo, Pattern
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -41,30 +40,28 @@ class Belief(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Joint moments of complex functionals and a moved state; their real parts stand first.
+    """Covariances of some rows and a moved state.
 
     Attributes
     ----------
-    mean : (2k,) ndarray
-    cross : (2k, B·n) ndarray
-        Covariance with the state.
-    own : (2k, 2k) ndarray
-        Covariance, that of what interpolation between instants leaves out included.
+    cross : (r, B·n) ndarray
+        With the state.
+    own : (r, r) ndarray
+        Of the rows, that of what interpolation between instants leaves out included.
     """
 
-    mean: FloatArray
     cross: FloatArray
     own: FloatArray
 
 
 class Reach(NamedTuple):
-    """How functionals reach into the past.
+    """How rows reach into the past.
 
     Attributes
     ----------
-    share : (k, K+1) ndarray
+    share : (r, K+1) ndarray
         Weights of the present and the K instants before it.
-    bridge : (k, k) ndarray
+    bridge : (r, r) ndarray
         Covariance of what interpolation between instants leaves out, in units of Q.
     """
 
@@ -73,50 +70,71 @@ class Reach(NamedTuple):
 
     @property
     def moving(self) -> FloatArray:
-        """Share of Q in the covariance of the functionals. (k, k)"""
+        """Share of Q in the covariance of the rows. (r, r)"""
         return np.asarray(np.outer(self.share[:, 0], self.share[:, 0]) + self.bridge)
 
 
-class Functionals:
-    """Complex functionals c = y (e + jf) of one instant's voltages as real rows, [Re; Im].
+class Rows:
+    """Real rows that read complex phasors of one instant's voltages, Re(conj(turn) y (e + jf)).
 
     Parameters
     ----------
-    y : (k, N) ndarray of complex
+    pattern : Pattern
+        Its functionals are y.
 
     Attributes
     ----------
-    plane : (2k, 2N) ndarray
-        The rows themselves.
+    pattern : Pattern
     """
 
-    def __init__(self, y: ComplexArray) -> None:
-        # Re(y V) = Re(y)·e - Im(y)·f and Im(y V) = Im(y)·e + Re(y)·f.
-        self.plane = np.block([[y.real, -y.imag], [y.imag, y.real]])
-        row, column = np.nonzero(self.plane)
-        self._value, self._functional = self.plane[row, column], row % max(len(y), 1)
-        self._row, self._column = row, column
+    def __init__(self, pattern: Pattern) -> None:
+        y = pattern.functionals
+        self.pattern = pattern
+        self._of_row = np.repeat(np.arange(y.shape[0]), np.diff(y.indptr))
+        at_power = np.full(y.shape[0], -1)
+        at_power[pattern.power] = pattern.metered
+        self._own = np.flatnonzero(at_power[self._of_row] == y.indices)
+        self._conjugate = y.data.conj()
+        # Re(w V) = Re(w)·e - Im(w)·f: two columns for every entry.
+        self._column = np.stack([y.indices, y.indices + y.shape[1]], axis=1).ravel()
+        self._ends = 2 * y.indptr
+        self._shape = y.shape[0], 2 * y.shape[1]
+        entries = np.ones(len(self._column)), self._column, self._ends
+        self._plane = sparse.csr_array(entries, shape=self._shape)
         self._patterns: Memo[tuple[BoolArray, sparse.csr_array]] = Memo()
 
-    def __len__(self) -> int:
-        return len(self.plane) // 2
+    def read(self, instants: ComplexArray) -> ComplexArray:
+        """The complex phasors y V of some instants' voltages (N, K+1). (r, K+1)"""
+        y = self.pattern.functionals
+        # Every row reads something; a sparse product would take thrice the time for so few columns.
+        return np.asarray(np.add.reduceat(y.data[:, None] * instants[y.indices], y.indptr[:-1]))
 
-    def of_blocks(self, share: FloatArray) -> sparse.csr_array:
-        """The rows as functionals of several blocks, with weights (k, B). (2k, B·2N)
+    def plane(self, linear: Linear) -> sparse.csr_array:
+        """The rows as functionals of [e; f]. (r, 2N)
+
+        What an earlier call returned is written over.
+        """
+        w = linear.turn[self._of_row] * self._conjugate
+        w[self._own] += linear.bend
+        self._plane.data = w.view(np.float64)
+        return self._plane
+
+    def of_blocks(self, plane: sparse.csr_array, share: FloatArray) -> sparse.csr_array:
+        """The rows as functionals of several blocks, with weights (r, B). (r, B·2N)
 
         What an earlier call returned is written over.
         """
         kept, rows = self._patterns.get((share != 0).tobytes(), lambda: self._laid_out(share != 0))
-        rows.data = (self._value[:, None] * share[self._functional])[kept]
+        whole = plane.data[:, None] * np.repeat(share, np.diff(self._ends), axis=0)
+        rows.data = whole[kept]
         return rows
 
     def _laid_out(self, reached: BoolArray) -> tuple[BoolArray, sparse.csr_array]:
         """Which entries of which blocks there are, and the rows that they make."""
-        (m, n), blocks = self.plane.shape, reached.shape[1]
-        kept = reached[self._functional]
+        (m, n), blocks, entries = self._shape, reached.shape[1], np.diff(self._ends)
+        kept = np.repeat(reached, entries, axis=0)
         column = (self._column[:, None] + n * np.arange(blocks))[kept]
-        count = np.bincount(self._row, weights=kept.sum(axis=1), minlength=m)
-        ends = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        ends = np.concatenate([[0], np.cumsum(entries * reached.sum(axis=1))])
         return kept, sparse.csr_array((np.ones(len(column)), column, ends), shape=(m, blocks * n))
 
 
@@ -205,15 +223,30 @@ class Lagged:
             total = total + factor * blocks[block]
         return np.asarray(total)
 
+    def instants(self, belief: Belief, prior: Belief) -> ComplexArray:
+        """Voltages of the present and the K instants before it, one step later. (N, K+1)"""
+        n = self.n
+        whole = np.concatenate([prior.x[:n], belief.x[: self.lags * n]]).reshape(-1, n).T
+        return np.asarray(whole[: n // 2] + 1j * whole[n // 2 :])
+
+    def revised(self, instants: ComplexArray, x: FloatArray) -> ComplexArray:
+        """Those voltages with what another state has of them. (N, K+1)"""
+        n, kept = self.n, min(self.past, self.lags + 1)
+        known = x[: kept * n].reshape(kept, 2, n // 2)
+        out = instants.copy()
+        out[:, :kept] = (known[:, 0] + 1j * known[:, 1]).T
+        return out
+
     def expect(
         self,
         belief: Belief,
         prior: Belief,
         noise: FloatArray,
-        functionals: Functionals,
+        rows: Rows,
+        plane: sparse.csr_array,
         reach: Reach | None,
     ) -> Expected:
-        """Moments of functionals of the voltages at several instants, one step later.
+        """Covariances of rows that read the voltages of several instants, one step later.
 
         Parameters
         ----------
@@ -221,57 +254,37 @@ class Lagged:
             Before the step, and what it has `moved` to.
         noise : (order·n, order·n) ndarray
             Q of the present.
-        functionals : Functionals
+        rows : Rows
+        plane : (r, n) csr_array
+            Their functionals of one instant.
         reach : Reach, optional
-            None if they do not.
+            None if they read the present only.
 
         Returns
         -------
         Expected
         """
         n, past, blocks, head = self.n, self.past, self.blocks, self.head
-        m, plane = 2 * len(functionals), functionals.plane
         if reach is None:
             cross = plane @ prior.P[:n]
-            return Expected(plane @ prior.x[:n], cross, cross[:, :n] @ plane.T)
+            return Expected(cross, plane @ cross[:, :n].T)
         share, now = reach.share, reach.share[:, 0]
         # Weights of the blocks as they stand before the step: the present is F s + g.
         folded = np.zeros((len(share), blocks))
         folded[:, : self.lags] = share[:, 1:]
         for factor, block in zip(self.process.transition[0], head, strict=True):
             folded[:, block] += factor * now
-        rows = functionals.of_blocks(folded)
+        reading = rows.of_blocks(plane, folded)
 
-        instants = np.concatenate([prior.x[:n], belief.x[: self.lags * n]]).reshape(-1, n)
-        mean = ((plane @ instants.T).reshape(2, *share.shape) * share).sum(axis=2).ravel()
-
-        before = rows @ belief.P
+        before = reading @ belief.P
         moving = plane @ noise[:n]
-        own = rows @ before.T
-        own.reshape(2, len(now), 2, len(now))[...] += reach.moving[:, None] * (
-            moving[:, :n] @ plane.T
-        ).reshape(2, len(now), 2, len(now))
+        own = reading @ before.T
+        own += reach.moving * (plane @ moving[:, :n].T)
 
-        cross = np.empty((m, blocks, n))
-        known = before.reshape(m, blocks, n)
+        cross = np.empty((len(share), blocks, n))
+        known = before.reshape(len(share), blocks, n)
         cross[:, 1:past] = known[:, : past - 1]
-        twice = np.concatenate([now, now])[:, None]
         for i, block in enumerate(head):
-            np.multiply(twice, moving[:, i * n : (i + 1) * n], out=cross[:, block])
+            np.multiply(now[:, None], moving[:, i * n : (i + 1) * n], out=cross[:, block])
             cross[:, block] += self._carried(known.swapaxes(0, 1), i)
-        return Expected(mean, cross.reshape(m, blocks * n), own)
-
-
-def turned(own: FloatArray, turn: ComplexArray, group: IntArray) -> FloatArray:
-    """Covariance of real rows Re(conj(turn_i) c_i), c_i being functional number group_i. (m, m)"""
-    return turned_rows(turned_rows(own, turn, group).T.copy(), turn, group)
-
-
-def turned_rows(functionals: FloatArray, turn: ComplexArray, group: IntArray) -> FloatArray:
-    """Re(conj(turn_i) c_i) of what stands for the real and imaginary parts of c. (m, …)"""
-    out = functionals.take(group, axis=0)
-    out *= turn.real[:, None]
-    other = functionals.take(group + len(functionals) // 2, axis=0)
-    other *= turn.imag[:, None]
-    out += other
-    return out
+        return Expected(cross.reshape(len(share), blocks * n), own)

@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
+from scipy.linalg import lapack
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.process import Sensitivity
@@ -176,3 +178,35 @@ def of_loads(
         return alone, (by_input @ size)[:, None], by_voltage
 
     return Matching(halves, START, window)
+
+
+def responses(
+    halves: tuple[FloatArray, ...],
+    plane: sparse.csr_array,
+    moving: FloatArray | float,
+    chol_S: FloatArray,
+) -> FloatArray:
+    """How the covariance of an innovation follows the levels, in units of itself.
+
+    Parameters
+    ----------
+    halves : tuple of c (2N, r_k) ndarrays
+        B_k.
+    plane : (m, 2N) csr_array
+        The rows as functionals of one instant's [e; f].
+    moving : (m, m) ndarray or 1
+        Share of Q in the covariance of the rows.
+    chol_S : (m, m) ndarray
+        L of S = L Lᵀ; what stands above the diagonal does not count.
+
+    Returns
+    -------
+    (c, m, m) ndarray
+        L⁻¹ D_k L⁻ᵀ, where D_k = ∂S/∂θ_k.
+    """
+    out = []
+    for half in halves:
+        rows = plane @ half
+        left, _ = lapack.dtrtrs(chol_S, moving * (rows @ rows.T), lower=1)
+        out.append(lapack.dtrtrs(chol_S, left.T, lower=1)[0])
+    return np.array(out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ from pse_analysis.measurement.layout import (
 )
 
 BoolArray = npt.NDArray[np.bool_]
+Linearisation = Literal["derivative", "transform"]
+"""Whether a power's row follows the voltage at its meter, or takes it as predicted."""
 Kept = TypeVar("Kept")
 
 
@@ -35,10 +37,15 @@ class RectangularModel:
 
     A phasor M∠φ of a complex c = y·V is two real rows of e^{-jφ}c, the one along φ with σ_M and the
     one across it with M σ_φ: in that frame their 2×2 covariance is diagonal. Powers are rows of the
-    current: with the predicted voltage |V|∠θ at the metered bus, e^{-jθ}c = (P - jQ)/|V|, whose
-    covariance diag(σ_P², σ_Q²)/|V|² is diagonal too. A channel that lost its partner keeps its row:
-    a magnitude alone is laid along the predicted angle, an angle alone is scaled by the predicted
+    current: with the voltage |V|∠θ at the metered bus, e^{-jθ}c = (P - jQ)/|V|, whose covariance
+    diag(σ_P², σ_Q²)/|V|² is diagonal too. A channel that lost its partner keeps its row: a
+    magnitude alone is laid along the predicted angle, an angle alone is scaled by the predicted
     magnitude.
+
+    The current conj(S/V) of a power moves with the voltage too, dI = conj(dS)/conj(V) -
+    conj(S) conj(dV)/conj(V)². ``derivative`` has both terms in its rows, so that a power says
+    nothing of the angle that all buses share; ``transform`` leaves the second one out, and takes
+    the current for one that is fixed in the frame of the predicted voltage.
 
     Parameters
     ----------
@@ -47,8 +54,8 @@ class RectangularModel:
 
     Notes
     -----
-    The linear transform is that of [qi2025], eqs. (8)–(14), with the full Y-bus for injections,
-    which eq. (14) prints without its diagonal. A rotation of a pair of rows changes neither the
+    ``transform`` is that of [qi2025], eqs. (8)–(14), with the full Y-bus for injections, which
+    eq. (14) prints without its diagonal. A rotation of a pair of rows changes neither the
     gain nor the innovation's NIS, so the frame is chosen for the diagonal covariance.
     """
 
@@ -63,7 +70,7 @@ class RectangularModel:
         row = np.concatenate([np.repeat(electric, np.diff(y_rows.indptr)), plain])
         col = np.concatenate([y_rows.indices, layout.position[plain]])
         value = np.concatenate([y_rows.data, np.ones(len(plain), dtype=complex)])
-        self.functionals = sparse.csr_array((value, (row, col)), shape=(m, n)).toarray()
+        self.functionals = sparse.csr_array((value, (row, col)), shape=(m, n))
         self.partner = _partners(layout)
         self._metered = np.where(quantity >= P, np.append(t.metered, 0)[t.of_row], layout.position)
         self._angle = layout.angular
@@ -92,9 +99,7 @@ class RectangularModel:
         """
         rows = np.arange(len(self.layout)) if rows is None else rows
         paired = self.paired(available)[rows]
-        pattern = self._patterns.get(
-            rows.tobytes() + paired.tobytes(), lambda: self._pattern(rows, paired)
-        )
+        pattern = self.pattern(rows, paired)
         value, spread, other = z[rows], sigma[rows], z[self.partner[rows]]
         unit = np.ones(len(rows), dtype=np.complex128)
         measured = np.where(pattern.is_angle, value, other)[pattern.known]
@@ -102,12 +107,18 @@ class RectangularModel:
         spread[pattern.both] *= np.maximum(np.abs(other[pattern.both]), RELATIVE_FLOOR_PU)
         return Frame(pattern, unit, pattern.sign * value, spread)
 
+    def pattern(self, rows: IntArray, paired: BoolArray) -> Pattern:
+        """What is common to all frames of some rows, of which some have their partner."""
+        key = rows.tobytes() + paired.tobytes()
+        return self._patterns.get(key, lambda: self._pattern(rows, paired))
+
     def _pattern(self, rows: IntArray, paired: BoolArray) -> Pattern:
         is_angle, is_size = self._angle[rows], self._size[rows]
         power = np.flatnonzero(~(is_angle | is_size))
         lone_size = np.flatnonzero(is_size & ~paired)
         lone_angle = np.flatnonzero(is_angle & ~paired)
         return Pattern(
+            self.functionals[rows],
             self._across[rows],
             np.where(is_angle, 0.0, self._sign[rows]),
             is_angle,
@@ -116,9 +127,7 @@ class RectangularModel:
             power,
             self._metered[rows[power]],
             lone_size,
-            self.functionals[rows[lone_size]],
             lone_angle,
-            self.functionals[rows[lone_angle]],
         )
 
     def rows(
@@ -127,6 +136,7 @@ class RectangularModel:
         sigma: FloatArray,
         available: BoolArray,
         voltage: ComplexArray,
+        linearisation: Linearisation = "transform",
     ) -> tuple[sparse.csr_array, FloatArray, FloatArray]:
         """H, z and σ of the linear form at a predicted voltage; rows follow the layout.
 
@@ -138,17 +148,24 @@ class RectangularModel:
             Rows that carry a value; the others come out finite but mean nothing.
         voltage : (N,) ndarray of complex
             Predicted voltage. [p.u.]
+        linearisation : {"transform", "derivative"}
 
         Returns
         -------
         H : (m, 2N) csr_array
         z_linear : (m,) ndarray
+            What H [e; f] is compared with.
         sigma_linear : (m,) ndarray
         """
-        turn, linear, spread = self.frame(z, sigma, available).at(voltage)
-        w = turn.conj()[:, None] * self.functionals
+        frame = self.frame(z, sigma, available)
+        pattern = frame.pattern
+        found = frame.at(self.functionals @ voltage, voltage[pattern.metered], linearisation)
+        w = sparse.csr_array(sparse.diags_array(found.turn.conj()) @ self.functionals).tolil()
+        w[pattern.power, pattern.metered] += found.bend.conj()
+        w = w.tocsr()
         # Re(w V) = Re(w)·e - Im(w)·f.
-        return sparse.csr_array(np.hstack([w.real, -w.imag])), linear, spread
+        H = sparse.csr_array(sparse.hstack([w.real, -w.imag]))
+        return H, found.linear + found.offset, found.spread
 
 
 class Pattern(NamedTuple):
@@ -156,6 +173,8 @@ class Pattern(NamedTuple):
 
     Attributes
     ----------
+    functionals : (r, N) csr_array of complex
+        What the rows read: c = functionals V.
     across : (r,) ndarray of complex
         1 for a row along its direction, j for one across it.
     sign : (r,) ndarray
@@ -166,10 +185,9 @@ class Pattern(NamedTuple):
         magnitudes without an angle and of angles without a magnitude.
     metered : ndarray of int
         Buses of the powers.
-    size_of, angle_of : (…, N) ndarray of complex
-        Functionals of the magnitudes and the angles that are alone.
     """
 
+    functionals: sparse.csr_array
     across: ComplexArray
     sign: FloatArray
     is_angle: BoolArray
@@ -178,9 +196,7 @@ class Pattern(NamedTuple):
     power: IntArray
     metered: IntArray
     lone_size: IntArray
-    size_of: ComplexArray
     lone_angle: IntArray
-    angle_of: ComplexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,35 +217,68 @@ class Frame:
     linear: FloatArray
     spread: FloatArray
 
-    def at(self, voltage: ComplexArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """The rest, at a predicted voltage.
+    def at(
+        self, current: ComplexArray, metered: ComplexArray, linearisation: Linearisation
+    ) -> Linear:
+        """The rows about predicted phasors.
 
         Parameters
         ----------
-        voltage : (N,) ndarray of complex
-            [p.u.]
+        current : (r,) ndarray of complex
+            What the rows read, c = ``pattern.functionals`` V. [p.u.]
+        metered : ndarray of complex
+            Voltages where the powers are metered. [p.u.]
+        linearisation : {"derivative", "transform"}
 
         Returns
         -------
-        turn : (r,) ndarray of complex
-            Row i reads Re(conj(turn_i) c_i), where c = ``model.functionals`` V.
-        z_linear, sigma_linear : (r,) ndarray
+        Linear
         """
         pattern = self.pattern
         unit, linear, spread = self.unit.copy(), self.linear.copy(), self.spread.copy()
-        at_meter = voltage[pattern.metered]
-        level = np.abs(at_meter)
-        unit[pattern.power] = at_meter / level
+        level = np.abs(metered)
+        unit[pattern.power] = metered / level
         linear[pattern.power] /= level
         spread[pattern.power] /= level
         if len(pattern.lone_size):
-            predicted = pattern.size_of @ voltage
+            predicted = current[pattern.lone_size]
             size = np.abs(predicted)
             unit[pattern.lone_size] = np.where(size > 0, predicted, 1) / np.where(size > 0, size, 1)
         if len(pattern.lone_angle):
-            size = np.abs(pattern.angle_of @ voltage)
+            size = np.abs(current[pattern.lone_angle])
             spread[pattern.lone_angle] *= np.maximum(size, RELATIVE_FLOOR_PU)
-        return unit * pattern.across, linear, spread
+        turn = unit * pattern.across
+        offset = np.zeros(len(linear))
+        bend = np.zeros(len(pattern.power), dtype=np.complex128)
+        if linearisation == "derivative":
+            at_power = current[pattern.power]
+            bend = at_power * pattern.across[pattern.power].conj() / level
+            # At the predicted phasors the row reads twice the power, which is a product of two.
+            offset[pattern.power] = (turn[pattern.power].conj() * at_power).real
+        return Linear(turn, bend, linear, offset, spread)
+
+
+class Linear(NamedTuple):
+    """Rows about predicted phasors: Re(conj(turn) c) + Re(conj(bend) V) = z + offset + noise.
+
+    Attributes
+    ----------
+    turn : (r,) ndarray of complex
+    bend : ndarray of complex
+        Of the voltages where the powers are metered; 0 for ``transform``.
+    linear : (r,) ndarray
+        Measured values, along the rows. [p.u.]
+    offset : (r,) ndarray
+        The constant of the expansion. [p.u.]
+    spread : (r,) ndarray
+        σ of the noise. [p.u.]
+    """
+
+    turn: ComplexArray
+    bend: ComplexArray
+    linear: FloatArray
+    offset: FloatArray
+    spread: FloatArray
 
 
 class Memo(Generic[Kept]):
