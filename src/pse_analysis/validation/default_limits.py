@@ -34,6 +34,7 @@ from pse_analysis.measurement import (
     SensorLayout,
 )
 from pse_analysis.measurement.layout import metered_bus
+from pse_analysis.parameters import Unbounded
 from pse_analysis.vocabulary import Quantity
 
 Array = npt.NDArray[np.float64]
@@ -96,13 +97,13 @@ class DefaultLimits:
     """
 
     apply: bool = True
-    voltage_pu: float = 2.0
-    power: float = 10.0
-    current: float = 20.0
-    angle_turns: float = 2.0
-    torque_pu: float = 20.0
-    speed: float = 3.0
-    clock_error_s: float = 1800.0
+    voltage_pu: Unbounded = 2.0
+    power: Unbounded = 10.0
+    current: Unbounded = 20.0
+    angle_turns: Unbounded = 2.0
+    torque_pu: Unbounded = 20.0
+    speed: Unbounded = 3.0
+    clock_error_s: Unbounded = 1800.0
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self)[1:]:
