@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from pse_analysis.vocabulary import markdown_text
+
 WIDTH = 100
 NOTHING = "–"
 LONGEST = 7
@@ -152,17 +154,20 @@ def markdown(
     order: Sequence[str] = (),
     notices: Sequence[str] = (),
 ) -> str:
-    """The same for the page of a recording."""
+    """The same for the page of a recording, names from data as they are and not as markup."""
     units, headings, rows = _content(scored, order)
     head = [" ".join(heading.split()) for heading in headings]
     rule = ["---", *("---:" for _ in head[1:])]
-    lines = ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows]
+    lines = ["| " + " | ".join(map(markdown_text, row)) + " |" for row in rows]
     table = ["| " + " | ".join(h.replace("|", "\\|") for h in head) + " |", f"|{'|'.join(rule)}|"]
-    closing = [line for sentence in _closing(scored, account) for line in ("", sentence)]
-    first = [line for sentence in notices for line in (f"**{ATTENTION}:** {sentence}", "")]
-    return "\n".join(
-        [f"# {_title(title, scored)}", "", *first, f"{units}.", "", *table, *lines, *closing]
-    )
+    closing = [
+        line for sentence in _closing(scored, account) for line in ("", markdown_text(sentence))
+    ]
+    first = [
+        line for sentence in notices for line in (f"**{ATTENTION}:** {markdown_text(sentence)}", "")
+    ]
+    top = [f"# {markdown_text(_title(title, scored))}", "", *first, f"{units}.", ""]
+    return "\n".join([*top, *table, *lines, *closing])
 
 
 def _closing(scored: pd.DataFrame, account: Sequence[str]) -> list[str]:

@@ -71,7 +71,12 @@ def estimated(
         origin = marks.entity_path("vm", element)
         buses.append(window.plot(origin, f"{element.replace('/', ' ')} |V| [p.u.]", own.value))
     everything = [
-        window.plot(f"normalised/{name}", f"{name}: innovation / σ [1]", [-6.0, 6.0], legend=False)
+        window.plot(
+            marks.named_path("normalised", name),
+            f"{name}: innovation / σ [1]",
+            [-6.0, 6.0],
+            legend=False,
+        )
         for name in methods
     ]
     top = float(np.nanquantile(nis, 0.995)) if nis.size and nis.notna().any().any() else 1.0
@@ -99,7 +104,8 @@ def estimated(
         for name, colour in methods.items():
             if name in score.columns.get_level_values("method"):
                 one = score[name]
-                marks.dots(stream, f"normalised/{name}", one, [colour] * one.shape[1], 1.2)
+                where = marks.named_path("normalised", name)
+                marks.dots(stream, where, one, [colour] * one.shape[1], 1.2)
         _draw_nis(stream, step, nis, methods)
         draw_statuses(stream, step)
         errors.draw(stream, "grid")
@@ -124,7 +130,8 @@ def _draw_bus(
     draw_measured(stream, f"{entity}/2_measured", measured[measured.element == element], 2.2)
     for number, (name, colour) in enumerate(methods.items(), start=3):
         one = vm[(vm.element == element) & (vm.method == name)].set_index("time_utc")
-        marks.band(stream, f"{entity}/{number}_{name}", one.value, one.sigma, f"{name} ±σ", colour)
+        where = marks.named_path(entity, f"{number}_{name}")
+        marks.band(stream, where, one.value, one.sigma, f"{name} ±σ", colour)
 
 
 def _draw_nis(

@@ -46,13 +46,17 @@ def machine_estimated(
         part = own[own.quantity == quantity]
         shown = part.true if truth is not None else part.value
         symbol = " ".join(title.split()[-2:])
-        tabs = [window.plot(f"{quantity}/{m}", f"{m}: {title}", shown) for m in methods]
+        tabs = [window.plot(marks.named_path(quantity, m), f"{m}: {title}", shown) for m in methods]
         rows.append(rrb.Tabs(*tabs, active_tab=first))
         if truth is not None:
             late = part[part.time_utc > window.start + 0.3 * (window.end - window.start)]
             ends = 1.2 * late.error.abs().groupby(late.method).max()
             errors = [
-                window.plot(f"error/{quantity}/{m}", f"{m}: error of {symbol}", [-ends[m], ends[m]])
+                window.plot(
+                    marks.named_path(f"error/{quantity}", m),
+                    f"{m}: error of {symbol}",
+                    [-ends[m], ends[m]],
+                )
                 for m in methods
             ]
             rows.append(rrb.Tabs(*errors, active_tab=first))
@@ -70,17 +74,16 @@ def machine_estimated(
             mine = own[own.method == name]
             for quantity in STATES:
                 part = mine[mine.quantity == quantity].set_index("time_utc").sort_index()
-                entity = f"{quantity}/{name}"
+                entity = marks.named_path(quantity, name)
                 if truth is not None:
                     true = part[["true"]]
                     marks.lines(stream, f"{entity}/1_true", true, [marks.TRUTH], width=3.0)
-                    error = f"error/{quantity}/{name}"
+                    error = marks.named_path(f"error/{quantity}", name)
                     marks.band(stream, error, part.error, part.sigma, f"{name} ±σ", colour)
                 if quantity == STATES[0]:
                     draw_measured(stream, f"{entity}/2_measured", measured, 1.2)
-                marks.band(
-                    stream, f"{entity}/3_{name}", part.value, part.sigma, f"{name} ±σ", colour
-                )
+                where = marks.named_path(entity, f"3_{name}")
+                marks.band(stream, where, part.value, part.sigma, f"{name} ±σ", colour)
         draw_statuses(stream, step)
         marks.page(stream, "text/estimated", _text(take, own, step, truth is not None))
 

@@ -14,6 +14,8 @@ import numpy as np
 import pandas as pd
 import rerun as rr
 
+from pse_analysis.vocabulary import markdown_text
+
 TIMELINE = "time"
 TRUTH = "#B4B4B4"
 BOUND = "#8C8C8C"
@@ -192,7 +194,7 @@ def bars(
         chart = rr.BarChart(
             height, abscissa=left, widths=[share] * len(height), color=_rgb(colours[name])
         )
-        stream.log(f"{entity}/{name}", chart, static=True)
+        stream.log(named_path(entity, str(name)), chart, static=True)
 
 
 def page(stream: rr.RecordingStream, entity: str, paragraphs: Sequence[str]) -> None:
@@ -217,10 +219,16 @@ def entity_path(*parts: str) -> str:
     )
 
 
+def named_path(entity: str, name: str) -> str:
+    """Entity path of something below another one, whatever its name holds."""
+    return f"{entity}/{rr.escape_entity_path_part(name)}"
+
+
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table for a page of text."""
+    """A table for a page of text; its cells may hold names from data."""
     ruler = ["---"] * len(head)
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ruler, *rows))
+    cells = [[markdown_text(cell) for cell in row] for row in rows]
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ruler, *cells))
 
 
 def _rgb(colour: str) -> list[int]:

@@ -16,7 +16,9 @@ def draw_statuses(stream: rr.RecordingStream, steps: pd.DataFrame) -> None:
     for name, one in steps.groupby("method", sort=False):
         colours = {s: _STATUS.get(s, VERMILION) for s in one.status.unique()}
         times = pd.DatetimeIndex(one.time_utc)
-        marks.lane(stream, f"status/{name}", times, one.status.tolist(), colours)
+        marks.lane(
+            stream, marks.named_path("status", str(name)), times, one.status.tolist(), colours
+        )
 
 
 def draw_measured(

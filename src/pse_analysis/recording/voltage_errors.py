@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from pse_analysis.drawing import method_colours
 from pse_analysis.grid.network import Network
-from pse_analysis.recording import grid_graph
+from pse_analysis.recording import grid_graph, marks
 from pse_analysis.recording.take import Take
 
 UNIT = "10⁻³ p.u."
@@ -62,7 +62,9 @@ class VoltageErrors:
     def views(self, origin: str, more: str = "") -> list[rrb.View]:
         """A view of the grid per method."""
         return [
-            grid_graph.view(f"{origin}/{name}", f"{name}: {self.what}{more}", self.network)
+            grid_graph.view(
+                marks.named_path(origin, name), f"{name}: {self.what}{more}", self.network
+            )
             for name in self.by_method
         ]
 
@@ -71,7 +73,7 @@ class VoltageErrors:
         for name, values in self.by_method.items():
             grid_graph.draw(
                 stream,
-                f"{origin}/{name}",
+                marks.named_path(origin, name),
                 self.network,
                 values,
                 largest=self.largest,

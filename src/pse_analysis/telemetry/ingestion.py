@@ -21,6 +21,7 @@ from pse_analysis.telemetry.units import check_units
 from pse_analysis.vocabulary import (
     UNITS,
     Quantity,
+    as_number,
     check,
     plain_columns,
     plain_unit,
@@ -293,15 +294,20 @@ def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
 
 def _floats(column: pd.Series) -> pd.Series:
     """Numbers of any type as floats; anything else as it is, for the schema to refuse."""
+    if pd.api.types.is_object_dtype(column.dtype):
+        absent = column.isna().to_numpy()
+        cells = [np.nan if empty else cell for cell, empty in zip(column, absent, strict=True)]
+        if any(isinstance(cell, str | bytes | bool | np.bool_) for cell in cells):
+            return column
+        try:
+            return pd.Series([as_number(cell) for cell in cells], column.index, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            return column
     kind = column.dtype
-    if pd.api.types.is_bool_dtype(kind) or pd.api.types.is_complex_dtype(kind):
-        return column
-    if pd.api.types.is_object_dtype(kind) and column.map(lambda v: isinstance(v, str | bool)).any():
-        return column
-    try:
-        return column.astype(np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return column
+    if pd.api.types.is_float_dtype(kind) or pd.api.types.is_integer_dtype(kind):
+        with np.errstate(over="ignore"):
+            return column.astype(np.float64)
+    return column
 
 
 def _is(cell: object, number: int) -> bool:

@@ -45,6 +45,7 @@ from pse_analysis.vocabulary.terms import (
     severity,
     usable,
 )
+from pse_analysis.vocabulary.texts import markdown_text
 
 __all__ = [
     "KEYS",
@@ -62,6 +63,7 @@ __all__ = [
     "Status",
     "as_number",
     "check",
+    "markdown_text",
     "plain_columns",
     "plain_unit",
     "plain_values",
