@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from endurance import tiny_case
+from tests.endurance import tiny_case
 
 from pse_analysis import recording
 from pse_analysis.errors import TableError
@@ -17,6 +17,7 @@ from pse_analysis.recording import Take
 from pse_analysis.recording.marks import markdown_table
 from pse_analysis.scoring import score
 from pse_analysis.telemetry import ingest, read_raw, write_raw
+from pse_analysis.validation import ValidateParams
 from pse_analysis.vocabulary import markdown_text
 
 NAMES = (
@@ -80,7 +81,13 @@ def test_all_stages_and_pages_bear_any_name(tmp_path: Path) -> None:
 
     truth = done.estimated.drop(columns=["method", "sigma"])
     scored = score(done.estimated, done.steps, run.validated, truth)
-    about = account.of_run(list(NAMES), run.validated, done.steps, done.residuals)
+    told = account.of_run(
+        *(raw.channels, run.validated, done.steps, done.residuals),
+        study=tiny_case.STUDY,
+        params=ValidateParams(),
+        model=tiny_case.network(),
+    )
+    about = (*told.findings, *told.notices, f"worst of all is {NAMES[0]}")
     title = "<img src=x onerror=alert(1)> | [a](b)"
     page = markdown(title, scored, about)
     assert "<" not in page

@@ -12,7 +12,7 @@ import pytest
 from pse_analysis.alignment import AlignParams
 from pse_analysis.errors import ParameterError, PseError
 from pse_analysis.estimation import EstimateParams, Method
-from pse_analysis.parameters import Study, build
+from pse_analysis.parameters import Study, Unbounded, build
 from pse_analysis.validation import Rule
 
 
@@ -161,6 +161,68 @@ def test_numbers_and_parts_that_a_method_cannot_use_are_refused(
         build(Method, {"name": "m", "filter": "kalman", **change}, "estimate.methods[0]")
 
 
+@dataclass(frozen=True)
+class Limits:
+    """Numbers of which some may be infinite."""
+
+    upper: Unbounded = float("inf")
+    span: tuple[Unbounded, Unbounded] = (0.0, 1.0)
+    ages: dict[str, Unbounded] = field(default_factory=dict)
+    maybe: Unbounded | None = None
+    share: float = 0.5
+    pair: tuple[float, float] = (0.0, 1.0)
+    by_name: dict[str, float] = field(default_factory=dict)
+    sign: Literal[1, -1] = 1
+    text: str = ""
+    ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        _ = 10.0**self.ratio  # overflows where the ratio is large
+
+
+INFINITE = float("inf")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"upper": INFINITE, "span": [-INFINITE, INFINITE], "maybe": INFINITE},
+        {"ages": {"pmu": INFINITE}},
+        {"share": 0, "pair": [1e12, -1e12], "by_name": {"a": 1e-30}},
+        {"sign": -1, "text": "<script> | =cmd() é"},
+    ],
+)
+def test_numbers_of_any_credible_size_are_taken(data: dict[str, Any]) -> None:
+    assert build(Limits, data, "t") is not None
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ({"share": INFINITE}, r"\[t.share\] expected a finite number, .* received inf"),
+        ({"pair": [0.0, -INFINITE]}, r"\[t.pair\] expected a finite number, .* received -inf"),
+        ({"by_name": {"a": 1e300}}, r"\[t.by_name\] expected a finite .* 1e.300: check its unit"),
+        ({"share": 1e-300}, r"\[t.share\] expected a finite number, 0 or 1e-30 … 1e\+12"),
+        ({"upper": float("nan")}, r"\[t.upper\] expected a number, received nan"),
+        ({"upper": 1e300}, r"\[t.upper\] expected a finite number, .* received 1e.300"),
+        ({"share": 2**63}, r"\[t.share\] expected a whole number of 64 bits, received one of 64"),
+        ({"sign": True}, r"\[t.sign\] must be one of 1, -1, received True"),
+        ({"sign": 1.0}, r"\[t.sign\] must be one of 1, -1, received 1.0"),
+        ({"sign": []}, r"\[t.sign\] must be one of 1, -1, received \[\]"),
+        ({"text": "a\x1b[2J"}, r"a text of one line without control characters, received 'a.x1b"),
+        ({"text": "a" * 10 + "\n"}, r"a text of one line"),
+        ({"text": ["a" * 500]}, r"expected str, received \['a{195,200}…"),
+        ({"ratio": 1e9}, r"\[t\] these values cannot be computed with \(.*check their sizes"),
+        ({"ratio": INFINITE}, r"\[t.ratio\] expected a finite number"),
+    ],
+)
+def test_numbers_and_texts_that_no_study_has_are_refused(
+    data: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ParameterError, match=expected):
+        build(Limits, data, "t")
+
+
 # --- study ----------------------------------------------------------------------------------------
 
 START = datetime(2016, 6, 9, tzinfo=UTC)
@@ -188,6 +250,23 @@ def test_another_zone_is_the_same_instant() -> None:
         ({"step_s": 1e-7}, r"step_s"),
         ({"history_s": 1e12}, r"history_s = 1e\+12 reaches back beyond the calendar"),
         ({"history_s": -1}, r"history_s ≥ 0, received .*history_s = -1.0"),
+        ({"step_s": float("inf")}, r"finite step_s > 0 .*received step_s = inf"),
+        (
+            {"step_s": 10**400},
+            r"\[study.step_s\] expected a whole number of 64 bits, .* of 1329",
+        ),
+        ({"step_s": []}, r"\[study.step_s\] expected float, received \[\]"),
+        ({"step_s": {"s": 300}}, r"\[study.step_s\] expected float, received \{'s': 300\}"),
+        ({"step_s": True}, r"\[study.step_s\] expected float, received True"),
+        ({"step_s": 1e-5}, r"more than 10000000 instants: raise step_s, or study a part at a time"),
+        ({"start": datetime(1, 1, 1, tzinfo=UTC)}, r"more than 10000000 instants|1900 … 2200"),
+        (
+            {
+                "start": datetime(9999, 12, 31, tzinfo=UTC),
+                "end": datetime(9999, 12, 31, 1, tzinfo=UTC),
+            },
+            r"expected start and end in the years 1900 … 2200",
+        ),
     ],
 )
 def test_impossible_study_is_refused(change: dict[str, Any], expected: str) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from reference import central_differences
 
+from pse_analysis.errors import NotConverged
 from pse_analysis.estimation.process import (
     LoadStatistics,
     Sensitivity,
@@ -88,3 +89,9 @@ def test_load_noise_does_not_depend_on_where_it_was_asked_before() -> None:
     used(there, MIDNIGHT)
     np.testing.assert_allclose(used(here, MIDNIGHT), new(here, MIDNIGHT), rtol=1e-12)
     assert np.abs(new(there, MIDNIGHT) - new(here, MIDNIGHT)).max() > 1e-9
+
+
+def test_a_grid_that_is_cut_has_no_sensitivities_and_its_buses_are_named() -> None:
+    network = library.load("ieee33").open_branch("32-33")
+    with pytest.raises(NotConverged, match=r"singular at this voltage: no path leads .* to 33; clo"):
+        Sensitivity(network).at(np.ones(network.n_bus, dtype=complex))

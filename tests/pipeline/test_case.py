@@ -85,3 +85,32 @@ def test_ill_formed_case_is_refused_with_its_file(
     with pytest.raises(ParameterError, match=message) as caught:
         load_case("small", cases)
     assert "small.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (GOOD + "trials = " + "9" * 5000, r"small\.toml: cannot be read: .*4300"),
+        (GOOD + "faults = " + "[" * 3000 + "]" * 3000, r"small\.toml: cannot be read"),
+        (GOOD.replace("A small study", "A\\u001b[2J study"), "title must be a text of one line"),
+        (GOOD.replace("A small study", " "), "title must be a text of one line"),
+        (GOOD.replace('"ieee14"', "1979-05-27"), r"grid must be a text, received datetime.date"),
+        (GOOD.replace("00:00Z\nend", "00:00\nend"), r"start has no time zone: .*append 'Z'"),
+        (GOOD.replace("step_s = 300", "step_s = inf"), "finite step_s > 0"),
+        (GOOD.replace("step_s = 300", "step_s = {}"), r"\[study.step_s\] expected float, rec"),
+        (GOOD + "#" * (1 << 20), "a case file of at most 1048576 bytes, received"),
+    ],
+)
+def test_odd_texts_end_in_an_error_that_names_the_file(
+    cases: Path, text: str, expected: str
+) -> None:
+    (cases / "small.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=expected):
+        load_case("small", cases)
+
+
+def test_a_file_that_cannot_be_opened_is_named(cases: Path) -> None:
+    (cases / "small.toml").unlink()
+    (cases / "small.toml").symlink_to("small.toml")
+    with pytest.raises(ParameterError, match="no case 'small'"):
+        load_case("small", cases)

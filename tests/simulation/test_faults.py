@@ -141,6 +141,14 @@ def test_the_truth_and_the_noise_do_not_depend_on_the_faults():
         (("stuck", 0.1), "kind in spike, stale, lost"),
         (("lost", 1.5), "rate in 0 … 1"),
         (("spike", 0.1), r"size = \[low, high\]"),
+        (("spike", 0.1, (1.0, np.inf)), r"0 < low ≤ high ≤ 1e\+06 for 'spike', received .*inf"),
+        (("spike", 0.1, (np.nan, 2.0)), r"size = \[low, high\]"),
+        (("delayed", 0.1, (1.0, np.inf)), r"high ≤ 1e\+09 for 'delayed'"),
+        (("stale", 0.1, (1e300, 1e300)), r"high ≤ 1e\+09 for 'stale'"),
+        (("duplicated", 0.1, (1.0, 1e10)), r"high ≤ 1e\+09 for 'duplicated'"),
+        (("lost", 0.1, (0.0, 0.0), False, "../x"), "source in scada, pmu"),
+        (("lost", 0.1, (0.0, 0.0), False, "", ("vm",)), "quantities in vm_pu, va_degree"),
+        (("lost", np.nan), "rate in 0 … 1"),
     ],
 )
 def test_parameters_out_of_range_are_refused(arguments, message):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.errors import NotConverged, ParameterError, TableError, Unobservable
+from pse_analysis.errors import GridError, NotConverged, ParameterError, TableError, Unobservable
 from pse_analysis.estimation import (
     composition,
     load_learning,
@@ -310,7 +310,7 @@ def estimate(
     else:
         try:
             estimator = build(method, model, layout, study, whole.between(None, start))
-        except (NotConverged, Unobservable) as error:
+        except (GridError, NotConverged, Unobservable) as error:
             estimator = _without_estimates(method.name, layout, str(error))
         snapshots = studied.snapshots()
     reference = None if truth is None else true_states(truth, model, studied.time, trial)
