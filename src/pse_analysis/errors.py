@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -35,6 +36,10 @@ class Unobservable(PseError, ArithmeticError):
     """The measurements do not determine the state."""
 
 
+class OutOfMemory(PseError, MemoryError):
+    """The system refused memory, or ended a process that took too much of it."""
+
+
 class StorageError(PseError, OSError):
     """A file could not be written whole, or read back as it was written."""
 
@@ -47,13 +52,19 @@ class StorageError(PseError, OSError):
         error
             What the system said.
         path
-            The file, or the folder, that was written to.
+            The file or folder that was written to.
         needed
             Size of the file, if it is known. [bytes]
         """
         size = "" if needed is None else f" of {megabytes(needed)}"
-        message = f"{path}{size} could not be written whole: {error.strerror or error}"
-        return cls(f"{message}{_remedy(error, path)}")
+        said = os.strerror(error.errno) if error.errno else str(error)
+        found = cls(f"{path}{size} could not be written whole: {said}{remedy(error.errno, path)}")
+        found.errno = error.errno
+        return found
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors of the system that only a write can have."""
 
 
 def megabytes(size: float) -> str:
@@ -61,16 +72,32 @@ def megabytes(size: float) -> str:
     return f"{size / 1e6:,.1f} MB"
 
 
-def _remedy(error: OSError, path: Path) -> str:
-    folder = next((p for p in path.parents if p.is_dir()), Path())
+def remedy(code: int | None, path: Path | None = None) -> str:
+    """What to do about an error of the system, as the end of a sentence; empty if it is no fault.
+
+    Parameters
+    ----------
+    code
+        The error's number.
+    path
+        The file or folder that it is about, if that is known.
+    """
     elsewhere = "or keep the data elsewhere with --data FOLDER"
-    if error.errno == errno.ENOSPC:
-        free = megabytes(shutil.disk_usage(folder).free)
-        return f"; {free} are free in {folder}: free some space there and run again, {elsewhere}"
-    if error.errno == errno.EDQUOT:
+    if code == errno.ENOSPC:
+        return f"{_free(path)}: free some space and run again, {elsewhere}"
+    if code == errno.EDQUOT:
         return f"; your quota there is used up: remove files and run again, {elsewhere}"
-    if error.errno == errno.EFBIG:
+    if code == errno.EFBIG:
         return "; no file may be that large here: raise the limit (ulimit -f) and run again"
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f": let this user write to {folder}, {elsewhere}"
-    return f": check the disk and run again, {elsewhere}"
+    if code in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f": let this user read and write there, {elsewhere}"
+    if code == errno.EIO:
+        return f": check the disk and run again, {elsewhere}"
+    return ""
+
+
+def _free(path: Path | None) -> str:
+    if path is None:
+        return ""
+    folder = next(p for p in (path, *path.absolute().parents) if p.is_dir())
+    return f"; {megabytes(shutil.disk_usage(folder).free)} are free there"

@@ -6,7 +6,6 @@ Standard library only at import; `rich` is imported when a stage has to run and 
 from __future__ import annotations
 
 import argparse
-import errno
 import os
 import signal
 import sys
@@ -17,9 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pse_analysis.errors import ParameterError, PseError, TableError
+from pse_analysis.errors import ParameterError, PseError, TableError, remedy
 from pse_analysis.files import check
-from pse_analysis.pipeline import runner, viewer
+from pse_analysis.pipeline import memory, runner, viewer
 from pse_analysis.pipeline.case import Case, list_cases, load_case, project_root
 from pse_analysis.pipeline.plan import NAMES, THREADS, Options, Reporter, Result, again
 from pse_analysis.pipeline.results import stored
@@ -261,10 +260,11 @@ def _explain(error: Exception, debug: bool) -> int:
         print(f"error: {error}", file=sys.stderr)
     elif isinstance(error, OSError):
         place = "" if error.filename is None else f"{error.filename}: "
-        full = ": free some space and run again" if error.errno == errno.ENOSPC else ""
-        print(f"error: {place}{error.strerror or error}{full}", file=sys.stderr)
-    elif isinstance(error, MemoryError):
-        print(f"error: out of memory: {error}: shorten the study or history", file=sys.stderr)
+        path = Path(error.filename) if isinstance(error.filename, str) else None
+        advice = remedy(error.errno, path)
+        print(f"error: {place}{error.strerror or error}{advice}", file=sys.stderr)
+    elif memory.ran_out(error):
+        print(f"error: {memory.explain(error, 'pse', 1)}", file=sys.stderr)
     else:
         print(
             f"error: {type(error).__name__}: {error}\nThis is a bug of pse_analysis, not of your "

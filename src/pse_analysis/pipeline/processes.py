@@ -8,8 +8,10 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
+from pse_analysis.errors import OutOfMemory
 from pse_analysis.pipeline.plan import THREADS
 
 Task = TypeVar("Task")
@@ -27,6 +29,11 @@ def each(function: Callable[[Task], Done], tasks: Sequence[Task], workers: int) 
         What it is called with; paths and parameters rather than tables.
     workers
         Processes; with one, the tasks run in this process.
+
+    Raises
+    ------
+    OutOfMemory
+        If the system ended one of the processes.
     """
     workers = min(workers, len(tasks))
     if workers <= 1:
@@ -45,6 +52,12 @@ def each(function: Callable[[Task], Done], tasks: Sequence[Task], workers: int) 
         for future in as_completed([pool.submit(function, task) for task in tasks]):
             yield future.result()
         pool.shutdown()
+    except BrokenProcessPool as error:
+        raise OutOfMemory(
+            "a process for the estimators ended suddenly, as when the system ends one because "
+            f"memory runs out: run again with fewer of them (--workers 1, now {workers}), or with "
+            "a shorter [study] or history_s, fewer trials, fewer methods"
+        ) from error
     except BaseException:
         # Do not wait for estimates that nobody will read.
         pool.shutdown(wait=False, cancel_futures=True)

@@ -18,8 +18,9 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 from pse_analysis import __version__
-from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.errors import FULL, ParameterError, PseError, StorageError, TableError
 from pse_analysis.files import SIMULATED, Facts, describe_folder, unchanged
+from pse_analysis.pipeline import memory, space
 from pse_analysis.pipeline.cache import CacheError, Entry, Store, lock
 from pse_analysis.pipeline.case import Case, load_case, project_root
 from pse_analysis.pipeline.descent import inputs, older, read_parameters
@@ -178,6 +179,7 @@ class _Run:
                 self._report_cached(stage.name)
                 return files
         self._require(stage.name)
+        self._require_room(stage.name, folder, self.store.raw_files(), {})
         self._perform(
             stage,
             self.raw.begin(),
@@ -262,6 +264,9 @@ class _Run:
             return self.store.publish(stage.name, Entry(folder, key, {}, seconds, read, found))
 
         self._require_writable(stage.name)
+        last = self.store.entries().get(stage.name)
+        before = {} if last is None else last.files
+        self._require_room(stage.name, self.store.folder, before, raw_files)
         return self._perform(
             stage,
             self.store.begin(stage.name, key),
@@ -292,6 +297,12 @@ class _Run:
                 f"first, or both with --until {self.options.only}"
             )
 
+    def _require_room(
+        self, stage: str, folder: Path, before: Mapping[str, Facts], raw: Mapping[str, Facts]
+    ) -> None:
+        bytes_needed = space.needed(stage, before, raw)
+        space.require(folder, bytes_needed, f"{stage} of case {self.case.name!r}")
+
     def _require_writable(self, stage: str) -> None:
         if not self.writable:
             raise CacheError(
@@ -313,6 +324,7 @@ class _Run:
         try:
             if self.work is None:
                 # numpy and pandas are imported here, and only here.
+                memory.require()
                 from pse_analysis.pipeline import stages
 
                 stages.check_case(self.case)
@@ -329,10 +341,16 @@ class _Run:
             )
             self.work[stage.name](job)
             published = publish(output, time.perf_counter() - since)
-        except BaseException:
+        except BaseException as error:
             # Just made, and under a name that is this process's: nobody else's files are in it.
             shutil.rmtree(output, ignore_errors=True)
             self.reporter.failed(stage.name)
+            if isinstance(error, PseError):
+                raise
+            if isinstance(error, OSError) and error.errno in FULL:
+                raise StorageError.of(error, output.parent) from error
+            if memory.ran_out(error):
+                raise memory.explain(error, stage.name, self.options.worker_count) from error
             raise
         self.ran.append(stage.name)
         self.reporter.finished(stage.name, time.perf_counter() - since)
