@@ -25,6 +25,7 @@ COUNTS = {
     "parquet": 80,
     "case text": 100,
     "case values": 80,
+    "parameters": 16,
     "pipeline": 8,
     "meaning": 8,
 }

@@ -21,7 +21,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from tests.endurance import odd_case_files, odd_parquet, odd_tables, same_meaning
+from tests.endurance import odd_case_files, odd_parameters, odd_parquet, odd_tables, same_meaning
 from tests.endurance.outcomes import OK, OUTCOMES, REFUSED, outcome, place
 
 SEED = 2026
@@ -52,16 +52,17 @@ class Target:
 TARGETS: tuple[Target, ...] = (
     Target("ingest", 0.16, odd_tables.INGEST, odd_tables.ingest_odd),
     Target("channels", 0.16, odd_tables.FRAME, odd_tables.read_channels),
-    Target("grid", 0.16, odd_tables.GRID, odd_tables.read_grid),
+    Target("grid", 0.12, odd_tables.GRID, odd_tables.read_grid),
     Target("machine", 0.06, odd_tables.FRAME, odd_tables.read_machine),
     Target("schema", 0.10, odd_tables.SCHEMA, odd_tables.check_schema),
     Target("parquet", 0.12, odd_parquet.FILES, odd_parquet.read_odd),
     Target("case text", 0.08, odd_case_files.TEXTS, odd_case_files.read_text),
     Target("case values", 0.10, odd_case_files.VALUES, odd_case_files.read_values),
+    Target("parameters", 0.04, odd_parameters.PARAMETERS, odd_parameters.run_stage),
     Target("pipeline", 0.03, odd_tables.PIPELINE, odd_tables.run_odd),
     Target("meaning", 0.03, same_meaning.CHANGES, same_meaning.compare),
 )
-"""All properties; the last two run whole pipelines, which takes a fraction of a second each."""
+"""All properties; the last three run stages, which takes a tenth of a second or several."""
 
 
 @dataclass

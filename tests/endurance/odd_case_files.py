@@ -245,7 +245,8 @@ def _alike(value: Any) -> list[Any]:
     return [odd for odd in VALUES_OF_KEYS if isinstance(odd, kind)]
 
 
-def _changed(data: dict[str, Any], changes: list[tuple[int, int, int]]) -> dict[str, Any]:
+def changed(data: dict[str, Any], changes: list[tuple[int, int, int]]) -> dict[str, Any]:
+    """The tables of a case after some of their values have changed."""
     for at, value, way in changes:
         places = _places(data)
         if not places:
@@ -291,7 +292,7 @@ def read_values(drawn: tuple[int, list[tuple[int, int, int]], int]) -> None:
         if tiny
         else tomllib.loads(CASES[number].read_text("utf-8"))
     )
-    parameters = _load(dumped_file(_changed(data, changes)).encode())
+    parameters = _load(dumped_file(changed(data, changes)).encode())
     if tiny and run % 2 == 0:
         _simulate(parameters, data)
 

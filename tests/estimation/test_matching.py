@@ -127,6 +127,17 @@ def test_levels_of_known_shapes_are_found_from_innovations_alone() -> None:
     assert (error < 0.2 * truth).all()
 
 
+def test_snapshots_that_tell_nothing_of_any_level_leave_them_near_the_start() -> None:
+    # As where every sample is older than the step whose noise is to be told.
+    matching = Matching(lambda _voltage: (), np.array([1e-3, 2e-6]))
+    memory = matching.begin()
+    for _ in range(50):
+        memory = matching.learn(memory, np.zeros((2, 3, 3)), np.zeros(3))
+    ratio = memory.level / matching.start
+    assert ratio[0] == pytest.approx(ratio[1])
+    assert 0.1 < ratio[0] < 10.0
+
+
 def test_a_level_that_is_not_seen_keeps_its_scale() -> None:
     """Two shapes, of which the meters see the first only: the other is known by its start alone."""
     made = Matching(lambda _voltage: (), np.array([1.0, 4.0]))

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import extended, gaussian, holt, noise, robust, unscented
 from pse_analysis.estimation.estimator import Estimator
 from pse_analysis.estimation.holt import HoltParams
@@ -16,6 +17,9 @@ from pse_analysis.estimation.unscented import Form, Scaling
 from pse_analysis.estimation.wls import state_columns
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout
+
+MOST_PASSES = 100
+"""Linearisations of one step; what has not converged by then never does."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,16 @@ class Composition:
     holt: HoltParams = field(default_factory=HoltParams)
     points: Scaling = field(default_factory=Scaling)
     protection: Protection = field(default_factory=Protection)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.passes <= MOST_PASSES:
+            raise ParameterError(
+                f"compose: expected passes in 1 … {MOST_PASSES}, received {self.passes}"
+            )
+        if not 0.0 < self.forgetting < 1.0:
+            raise ParameterError(
+                f"compose: expected 0 < forgetting < 1, received {self.forgetting}"
+            )
 
 
 def process_of(composition: Composition) -> holt.Process:

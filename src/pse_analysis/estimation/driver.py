@@ -124,9 +124,11 @@ def run(
     for k, snapshot in enumerate(snapshots):
         begun = time.perf_counter()
         try:
-            state, info = (
-                estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
-            )
+            # A state that leaves the range of numbers is told by its status.
+            with np.errstate(all="ignore"):
+                state, info = (
+                    estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
+                )
         except (NotConverged, Unobservable, np.linalg.LinAlgError) as error:
             # One snapshot that cannot be computed with stops no run: the next one starts anew.
             status = (

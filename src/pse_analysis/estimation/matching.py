@@ -59,6 +59,10 @@ class Matched(NamedTuple):
     steps: float = 0.0
 
 
+LEAST_INFORMATION = 1e-30
+"""Information on the levels, in their starts' own scale, that stands for none."""
+
+
 @dataclass(frozen=True, eq=False)
 class Matching:
     """Process noise with estimated levels.
@@ -125,8 +129,9 @@ class Matching:
         """
         scale = self.start
         scaled = A * np.outer(scale, scale)
-        # Where the meters tell nothing of a shape, its start is the best fit.
-        ridge = 1e-9 * max(float(np.trace(scaled)), 1e-300)
+        # Where the meters tell nothing of a shape, its start is the best fit; where they tell
+        # nothing at all, that of every shape, and the ridge must still have an inverse.
+        ridge = max(1e-9 * float(np.trace(scaled)), LEAST_INFORMATION)
         inverse = np.linalg.inv(scaled + ridge * np.eye(len(scale)))
         best, spread = inverse @ (b * scale + ridge), np.sqrt(2.0 * np.diagonal(inverse))
         above = np.maximum(best, 0.0)

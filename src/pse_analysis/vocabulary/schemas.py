@@ -245,6 +245,8 @@ def _broken(table: str, frame: pd.DataFrame, error: pandera.errors.SchemaError) 
     """The row that breaks its schema, what was expected there and what came."""
     column = str(getattr(error.schema, "name", None) or "?")
     series, where = frame[column], f"{table}: column {column!r}"
+    if not len(series):
+        return f"{where}: no rows, and type {series.dtype}; expected {error.check}: fill the table"
     if str(error.check) == "not_nullable":
         wanted, bad = "a value in every row", series.isna()
     elif getattr(error.check, "error", None) == "text":
@@ -253,8 +255,10 @@ def _broken(table: str, frame: pd.DataFrame, error: pandera.errors.SchemaError) 
         wanted, bad = error.check.error, _failing(table, series)
     else:
         kind = schema(table).columns[column].dtype
-        first = f", e.g. {shown(series.iloc[0])}" if len(series) else ""
-        return f"{where}: expected type {kind}, received {series.dtype}{first}; convert the column"
+        return (
+            f"{where}: expected type {kind}, received {series.dtype}, e.g. "
+            f"{shown(series.iloc[0])}; convert the column"
+        )
     row = int(np.argmax(np.asarray(bad, dtype=bool)))
     keys = [f"{key} {shown(frame[key].iloc[row])}" for key in KEYS[table] if key != column]
     return (
