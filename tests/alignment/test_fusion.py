@@ -147,6 +147,12 @@ def test_old_samples_are_left_out_by_source() -> None:
     assert by_channel.to_dict() == {VM: 2, POWER: 3}
 
 
+@pytest.mark.parametrize("age", [np.inf, 1e12])
+def test_without_a_largest_age_the_last_sample_holds_for_ever(age: float) -> None:
+    params = AlignParams(growth="none", max_age_s={"pmu": age}, default_max_age_s=age)
+    assert len(aligned([(VM, 0, 0, 1.0)], params)) == 4
+
+
 def test_values_and_sigmas_come_out_in_per_unit_with_the_sign_turned() -> None:
     table = aligned([(POWER, 0, 0, 740.0)])
     assert table["value_pu"].iloc[0] == pytest.approx(-0.74 / 37.0)

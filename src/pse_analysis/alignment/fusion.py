@@ -29,6 +29,8 @@ from pse_analysis.vocabulary import Origin, Quantity, check
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+CENTURY_S = 3.2e9
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -227,6 +229,8 @@ def _within(validated: pd.DataFrame, study: Study, params: AlignParams) -> pd.Da
     A clock that was reset stamps samples decades away; nothing is to be laid out over them.
     """
     oldest = max(params.default_max_age_s, *params.max_age_s.values(), params.pseudo.window_s)
+    # Infinity is no length of time that can be subtracted.
+    oldest = min(oldest, CENTURY_S)
     latest = params.latency_s + params.time.largest_delay_s
     since, until = (pd.Timestamp(t).tz_convert("UTC") for t in (study.history_start, study.end))
     since -= pd.Timedelta(seconds=oldest)
