@@ -139,6 +139,7 @@ def _near(path: Path) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``pse``; returns the exit code."""
+    _open_closed_streams()
     # Printing σ must not end a run on a terminal that cannot show it.
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -168,6 +169,21 @@ def ending_by_signal() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _open_closed_streams() -> None:
+    """Lead streams that whoever started us closed to nowhere.
+
+    Otherwise the next file that is opened takes the number of the closed stream, and what libraries
+    print goes into it.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
 
 
 def parser() -> argparse.ArgumentParser:

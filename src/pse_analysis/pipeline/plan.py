@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -169,6 +170,8 @@ class Options:
                 )
         if self.workers is not None and self.workers < 1:
             raise ParameterError(f"workers: expected 1 or more, received {self.workers}")
+        for folder in (self.data_folder, self.cases):
+            _require_utf8(folder)
 
     @property
     def data_folder(self) -> Path:
@@ -226,6 +229,19 @@ class Job:
 
 
 Work = Mapping[str, Callable[[Job], None]]
+
+
+def _require_utf8(folder: Path | None) -> None:
+    """Refuse a name that parquet and Rerun, which take UTF-8 only, could not open."""
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError as error:
+        shown = str(folder).encode(errors="backslashreplace").decode()
+        raise ParameterError(
+            f"{shown}: this name is not UTF-8 where the locale's encoding is "
+            f"{sys.getfilesystemencoding()}: set LANG=C.UTF-8 and unset PYTHONUTF8, or choose a "
+            "folder with a name of ASCII letters"
+        ) from error
 
 
 @dataclass(frozen=True)
