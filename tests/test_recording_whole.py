@@ -82,11 +82,11 @@ def test_file_that_the_disk_cut_or_changed_is_an_error_and_removed(
     [
         (
             errno.ENOSPC,
-            r"MB could not .* No space left .* MB are free in .*: free some",
+            r"MB could not .* No space left .* MB are free there: free some",
         ),
         (errno.EDQUOT, "your quota there is used up: remove files"),
         (errno.EFBIG, r"raise the limit \(ulimit -f\)"),
-        (errno.EROFS, "let this user write to"),
+        (errno.EROFS, "let this user read and write there"),
         (errno.EIO, "check the disk and run again"),
     ],
 )
