@@ -25,7 +25,9 @@ MODULES = {
 # A part may import itself and what stands in an earlier line.
 LAYERS = (
     ("errors",),
+    ("leftovers",),
     ("files",),
+    ("checksums",),
     ("parameters", "vocabulary"),
     ("grid", "machine", "measurement", "telemetry"),
     ("simulation", "validation"),

@@ -1,4 +1,4 @@
-"""Files that are whole and unchanged: digests, checksums of a folder, replacement in one step.
+"""Files that are whole and unchanged: their digests, and replacement in one step.
 
 Standard library only: a cached run uses it without waiting for pandas.
 """
@@ -8,20 +8,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import stat
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from pse_analysis.errors import DamagedFile, TableError
-
-CHECKSUMS = "checksums.json"
-"""File in a raw folder that lists size and digest of every table in it."""
-
-SIMULATED = "simulated.json"
-"""File in a raw folder that a simulation made."""
+from pse_analysis.leftovers import orphans, remove_file, temporary
 
 DIGEST_BYTES = 16
 MAX_JSON_BYTES = 64 * 2**20
@@ -31,6 +25,22 @@ _PARQUET = b"PAR1"
 
 Facts = Mapping[str, Any]
 """What is known of one file: ``bytes``, ``digest``, of a parquet file ``content``, ``times``."""
+
+
+def real(path: str | Path) -> Path:
+    """Where a path leads, with every link in it followed.
+
+    Raises
+    ------
+    TableError
+        If its links lead in a circle.
+    """
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError) as error:
+        raise TableError(
+            f"{path} is a link that leads back to itself: make it lead to a folder, or remove it"
+        ) from error
 
 
 def flush(path: Path) -> None:
@@ -51,22 +61,67 @@ def flush_folder(folder: Path) -> None:
 
 
 def write_json(path: Path, value: object) -> None:
-    """Replace a JSON file as a whole: readers see the old text or the new one."""
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False)
-    temporary.write_text(text + "\n", encoding="utf-8")
-    flush(temporary)
-    os.replace(temporary, path)
+    """Replace a JSON file as a whole: readers see the old text or the new one.
+
+    Raises
+    ------
+    TableError
+        If a link, a folder or a pipe stands in its place.
+    """
+    refuse_foreign(path)
+    for orphan in orphans(path):
+        remove_file(orphan)
+    # Names of files need not be UTF-8; escaped, they are text that can be read back.
+    text = json.dumps(value, indent=1, sort_keys=True)
+    part = temporary(path)
+    try:
+        with part.open("x", encoding="utf-8") as file:
+            file.write(text + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
     flush(path.parent)
 
 
+def refuse_foreign(path: Path) -> None:
+    """Refuse to replace what cannot be a file of this program.
+
+    Raises
+    ------
+    TableError
+        If a link, a folder or a pipe stands there.
+    """
+    if not os.path.lexists(path):
+        return
+    mode = path.lstat().st_mode
+    if stat.S_ISREG(mode):
+        return
+    kinds = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder"}
+    raise TableError(
+        f"{path}: expected a file of this program, received "
+        f"{kinds.get(stat.S_IFMT(mode), 'a pipe, socket or device')}: move it away and run again"
+    )
+
+
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; an empty one if the file is missing or damaged."""
+    """Read a JSON object; an empty one if the file is missing or damaged.
+
+    Raises
+    ------
+    TableError
+        If this user may not read it.
+    """
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_JSON_BYTES:
             return {}
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError, RecursionError):
+    except PermissionError as error:
+        raise _unreadable(path, error) from error
+    except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
 
@@ -135,13 +190,30 @@ def unchanged(path: Path, facts: Facts, *, thorough: bool = False) -> bool:
     """
     try:
         found = path.stat()
-        if found.st_size != facts["bytes"]:
+        if found.st_size != facts["bytes"] or not stat.S_ISREG(found.st_mode):
             return False
         if not thorough and _times(found) == facts.get("times"):
             return True
         return digest_file(path) == str(facts["digest"])
     except OSError:
         return False
+
+
+def refresh(folder: Path, files: Mapping[str, Facts]) -> dict[str, Facts]:
+    """Descriptions of files with their times as they are now, where the content did not change.
+
+    A copy has other times than the original; noted once, its files need not be read every time.
+    """
+    now = {}
+    for name, facts in files.items():
+        path = folder / name
+        try:
+            times: Any = _times(path.stat())
+        except OSError:
+            times = facts.get("times")
+        moved = times != facts.get("times") and unchanged(path, facts, thorough=True)
+        now[name] = {**facts, "times": times} if moved else facts
+    return now
 
 
 def check(path: Path, facts: Facts, remedy: str) -> None:
@@ -161,7 +233,10 @@ def check(path: Path, facts: Facts, remedy: str) -> None:
             f"{path} is not as it was written (expected {facts['bytes']} bytes, received {size}); "
             f"it was damaged or changed: {remedy}"
         )
-    received = digest_file(path)
+    try:
+        received = digest_file(path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
     if received != facts["digest"]:
         raise DamagedFile(
             f"{path} is not as it was written (expected digest {facts['digest']}, received "
@@ -170,50 +245,32 @@ def check(path: Path, facts: Facts, remedy: str) -> None:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Files below a folder, sorted; hidden ones are left out, links to folders not followed."""
+    """Files below a folder, sorted; hidden ones are left out, links to folders not followed.
+
+    Raises
+    ------
+    TableError
+        If this user may not look into a folder: what lies there must not be missed.
+    """
     found = []
-    for root, folders, names in os.walk(folder):
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):
+            raise _unreadable(Path(error.filename), error) from error
+
+    for root, folders, names in os.walk(folder, onerror=refuse):
         folders[:] = [name for name in folders if not name.startswith(".")]
         found += [Path(root, name) for name in names if not name.startswith(".")]
     yield from sorted(path for path in found if path.is_file())
 
 
-def refuse_links(folder: Path, names: Iterable[str]) -> None:
-    """Refuse links inside a folder that lead out of it, or to folders.
-
-    The folder itself may be a link: its owner chose where the data lie.
-
-    Parameters
-    ----------
-    folder
-        Where to look.
-    names
-        Files and folders in it that will be read.
-
-    Raises
-    ------
-    TableError
-        With the first such link.
-    """
-    inside = folder.resolve()
-    for name in names:
-        waiting = [folder / name]
-        while waiting:
-            path = waiting.pop()
-            if path.is_symlink() and not (path.is_file() and path.resolve().is_relative_to(inside)):
-                raise TableError(
-                    f"{path} is a link to {os.readlink(path)}: expected the file itself, since "
-                    "what a case is read from must lie in its own folder: copy it there, or make "
-                    f"{folder} as a whole a link to where the data are"
-                )
-            if path.is_dir() and not path.is_symlink():
-                waiting += path.iterdir()
-
-
 def describe_folder(
-    folder: Path, known: Mapping[str, Facts] | None = None
+    folder: Path,
+    known: Mapping[str, Facts] | None = None,
+    *,
+    asked: Callable[[str], bool] = lambda name: True,
 ) -> dict[str, dict[str, Any]]:
-    """Description of every file below a folder, by its path relative to it, sorted.
+    """Description of the files below a folder, by their paths relative to it, sorted.
 
     Parameters
     ----------
@@ -221,15 +278,26 @@ def describe_folder(
         Where to look.
     known
         Earlier descriptions; a file whose size and times agree with its own is not read again.
+    asked
+        Whether a file is asked for, by its path relative to the folder; others are not opened.
     """
     found = {}
     for path in files_below(folder):
         name = path.relative_to(folder).as_posix()
+        if not asked(name):
+            continue
         facts = (known or {}).get(name, {})
         status = path.stat()
         same = facts.get("bytes") == status.st_size and facts.get("times") == _times(status)
-        found[name] = dict(facts) if same else describe(path)
+        try:
+            found[name] = dict(facts) if same else describe(path)
+        except PermissionError as error:
+            raise _unreadable(path, error) from error
     return found
+
+
+def _unreadable(path: Path, error: OSError) -> TableError:
+    return TableError(f"{path} cannot be read ({error.strerror}): check its owner and mode")
 
 
 def is_facts(value: object) -> bool:
@@ -244,99 +312,3 @@ def is_facts(value: object) -> bool:
         and isinstance(times, list)
         and all(type(time) is int for time in times)
     )
-
-
-def write_checksums(folder: Path) -> None:
-    """List size and digest of every file below a folder, in the folder.
-
-    Call it again after a deliberate change: what differs from the list is refused as damaged.
-    """
-    files = describe_folder(folder)
-    files.pop(CHECKSUMS, None)
-    for facts in files.values():
-        # Times are of this copy; a list that travels with the files must hold for every copy.
-        del facts["times"]
-    write_json(folder / CHECKSUMS, {"version": 1, "files": files})
-
-
-def read_checksums(folder: Path) -> dict[str, Facts]:
-    """What the list of a folder says of its files; empty if there is none.
-
-    Raises
-    ------
-    DamagedFile
-        If there is one, but it cannot be read.
-    """
-    path = folder / CHECKSUMS
-    if not path.is_file():
-        return {}
-    files = read_json(path).get("files")
-    if not isinstance(files, dict) or not all(map(is_facts, files.values())):
-        raise DamagedFile(
-            f"{path} is not a list of checksums; it was damaged or changed: {accept(folder)}"
-        )
-    return files
-
-
-def accept(folder: Path) -> str:
-    """What to do about a raw file that differs from its checksum."""
-    if (folder / SIMULATED).is_file():
-        return f"`pse run {folder.name} --force` simulates it again"
-    return (
-        "restore it from a copy; or, if the change is yours, accept it with `pse verify "
-        f"{folder.name} --accept` or pse_analysis.telemetry.accept({str(folder)!r})"
-    )
-
-
-def remove_own(folder: Path, own: Callable[[str], bool]) -> bool:
-    """Remove a folder's own files, and the folder if nothing else is in it.
-
-    Links are never followed: one to a file or folder counts as somebody else's and stays.
-
-    Parameters
-    ----------
-    folder
-        Where to begin; not a link.
-    own
-        Whether a file may go, by its path relative to the folder, with ``/`` between parts.
-
-    Returns
-    -------
-    bool
-        Whether the folder is gone.
-    """
-    if folder.is_symlink() or not folder.is_dir():
-        return not os.path.lexists(folder)
-    for root, folders, names in os.walk(folder, topdown=False):
-        for name in names:
-            path = Path(root, name)
-            if stat.S_ISREG(path.lstat().st_mode) and own(path.relative_to(folder).as_posix()):
-                path.unlink()
-        for name in folders:
-            _remove_empty(Path(root, name))
-    return _remove_empty(folder)
-
-
-def _remove_empty(folder: Path) -> bool:
-    try:
-        os.rmdir(folder)
-    except OSError:
-        return False
-    return True
-
-
-_TEMPORARY = re.compile(r".*\.tmp-(\d+)", re.DOTALL)
-
-
-def is_orphan(path: Path) -> bool:
-    """Whether a temporary file or folder, ``….tmp-PID``, belongs to a process that is gone."""
-    match = _TEMPORARY.fullmatch(path.name)
-    if match is None:
-        return False
-    try:
-        os.kill(int(match[1]), 0)
-    except ProcessLookupError:
-        return True
-    except (OSError, OverflowError):
-        return False
-    return False

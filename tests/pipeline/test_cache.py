@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from pse_analysis.errors import TableError
 from pse_analysis.pipeline import cache
-from pse_analysis.pipeline.cache import CacheError, Entry, Store, lock
+from pse_analysis.pipeline.cache import Entry, Store, lock
 
 ONE, TWO = "1" * 20, "2" * 20
 
@@ -204,7 +205,7 @@ def test_lock_is_not_written_through_a_link(tmp_path: Path, kind: str) -> None:
     else:
         (tmp_path / "case" / ".lock").symlink_to(mine)
         with (
-            pytest.raises(CacheError, match=r"\.lock is a symbolic link.*remove it"),
+            pytest.raises(TableError, match=r"\.lock: expected a file .* a link: move it away"),
             lock(tmp_path / "case", "small"),
         ):
             pass

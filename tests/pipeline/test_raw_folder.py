@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pse_analysis.checksums import write_checksums
 from pse_analysis.errors import DamagedFile, TableError
-from pse_analysis.files import write_checksums
 from pse_analysis.pipeline.cache import CacheError
 from pse_analysis.pipeline.raw_folder import RawFolder
 
@@ -19,7 +19,7 @@ WRITTEN = {"channels.parquet", "checksums.json", "simulated.json"}
 def write_raw(raw: RawFolder, key: str, text: str) -> None:
     folder = raw.begin()
     (folder / "channels.parquet").write_text(text, encoding="utf-8")
-    raw.publish(key, {}, folder, 1.0)
+    raw.publish({"fingerprint": key}, folder)
 
 
 def test_simulated_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:

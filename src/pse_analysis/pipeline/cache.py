@@ -10,39 +10,50 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
+import json
 import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from pse_analysis.errors import PseError
 from pse_analysis.files import (
+    DIGEST_BYTES,
     Facts,
     describe_folder,
     flush,
     flush_folder,
     is_facts,
-    is_orphan,
     read_json,
-    remove_own,
+    refresh,
+    refuse_foreign,
     unchanged,
     write_json,
 )
+from pse_analysis.leftovers import free, orphans, remove_file, remove_own, temporary
 
 MANIFEST = "manifest.json"
-VERSION = 2
+VERSION = 3
 
-STAGES = ("validate", "align", "estimate", "score")
-"""Stages that have a folder of their own below that of the case."""
+TABLES = {
+    "validate": ("validated",),
+    "align": ("aligned",),
+    "estimate": ("estimated", "residuals", "steps"),
+    "score": ("scored",),
+}
+"""Stages that have a folder of their own below that of the case, and the tables they write."""
+
+SUMMARY = "summary.txt"
 
 _FOLDER = re.compile(r"[0-9a-f]{20}(-\d+)?")
-_TEMPORARY = re.compile(r"\.[0-9a-f]{20}\.tmp-\d+")
-_OWN = re.compile(r"[a-z_]+(-\d+-\d+)?\.parquet|(validate|align|estimate|score)\.rrd|summary\.txt")
+_TEMPORARY = re.compile(r"\.[0-9a-f]{20}\.tmp-\d+(-\d+)?")
 READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
@@ -62,21 +73,22 @@ def lock(folder: Path, case: str) -> Iterator[bool]:
 
     Raises
     ------
-    CacheError
-        If another process holds it.
+    PseError
+        If another process holds it, or no such folder or file can be made.
     """
+    path = folder / ".lock"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        refuse_foreign(path)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise CacheError(
-                f"{folder / '.lock'} is a symbolic link, expected a file of this program: remove it"
-            ) from error
-        if error.errno not in READ_ONLY or not folder.is_dir():
-            raise
-        yield False
-        return
+        if error.errno in READ_ONLY and folder.is_dir():
+            yield False
+            return
+        raise CacheError(
+            f"{folder}: no folder for the results of case {case!r} can be made there "
+            f"({error.strerror}): mend that, or name another folder of data with --data DIR"
+        ) from error
     with os.fdopen(handle, "r+", encoding="utf-8", errors="replace") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -112,6 +124,8 @@ class Entry:
         What it read of the case file, as canonical JSON by key.
     inputs : mapping
         Digest of the content of every file it read, by name.
+    finished : str
+        When it ended, in ISO 8601; empty before.
     """
 
     folder: Path
@@ -120,6 +134,7 @@ class Entry:
     seconds: float
     parameters: Mapping[str, str]
     inputs: Mapping[str, str]
+    finished: str = ""
 
     def damaged(self, *, thorough: bool = False) -> tuple[str, ...]:
         """Files that are not as they were written.
@@ -137,23 +152,29 @@ class Entry:
 
 
 def _entry(folder: Path, facts: Any) -> Entry | None:
-    """An entry from the manifest; None if it does not have the form that this program writes."""
+    """An entry from the manifest; None if it is not as this program wrote it."""
     if not isinstance(facts, dict):
         return None
-    place, fingerprint, seconds = (facts.get(key) for key in ("folder", "fingerprint", "seconds"))
+    place, fingerprint, seconds, finished = (
+        facts.get(key) for key in ("folder", "fingerprint", "seconds", "finished")
+    )
     if (
         not isinstance(place, str)
         or not isinstance(fingerprint, str)
-        or not isinstance(seconds, int | float)
+        or not isinstance(finished, str)
+        or not isinstance(seconds, float)
         or _FOLDER.fullmatch(place) is None
+        or folder.is_symlink()
         or (folder / place).is_symlink()
     ):
         return None
     parameters, inputs = _texts(facts.get("parameters")), _texts(facts.get("inputs"))
     files = _files(facts.get("files"))
-    if parameters is None or inputs is None or files is None or not all(map(_is_own, files)):
+    if parameters is None or inputs is None or files is None:
         return None
-    return Entry(folder / place, fingerprint, files, float(seconds), parameters, inputs)
+    if not all(is_own(folder.name, name) for name in files):
+        return None
+    return Entry(folder / place, fingerprint, files, seconds, parameters, inputs, finished)
 
 
 def _texts(value: Any) -> Mapping[str, str] | None:
@@ -166,32 +187,68 @@ def _files(value: Any) -> Mapping[str, Facts] | None:
     return MappingProxyType(value) if valid else None
 
 
+def seal(value: object) -> str:
+    """Digest of a part of the manifest: a part that was damaged or edited differs from its own."""
+    text = json.dumps(value, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=DIGEST_BYTES).hexdigest()
+
+
 @dataclass(frozen=True)
 class Store:
     """Processed results of one case: ``folder/manifest.json`` and ``folder/<stage>/…``."""
 
     folder: Path
 
-    def _stages(self) -> dict[str, Any]:
-        stages = read_json(self.folder / MANIFEST).get("stages")
-        return dict(stages) if isinstance(stages, dict) else {}
+    def _parts(self) -> dict[str, Any]:
+        """What the manifest says of each stage, and of the files of the raw folder as ``raw``.
+
+        A part that differs from its seal is None.
+        """
+        value = read_json(self.folder / MANIFEST)
+        stages, seals = value.get("stages"), value.get("seals")
+        if value.get("version") != VERSION or not isinstance(stages, dict):
+            return {}
+        known = seals if isinstance(seals, dict) else {}
+        parts = {**stages, "raw": value.get("raw")}
+        return {name: p if known.get(name) == seal(p) else None for name, p in parts.items()}
 
     def entries(self) -> Mapping[str, Entry]:
         """Stages that the manifest names; one it cannot make sense of is left out."""
-        stages = self._stages()
-        found = {s: _entry(self.folder / s, stages[s]) for s in STAGES if s in stages}
+        parts = self._parts()
+        found = {s: _entry(self.folder / s, parts[s]) for s in TABLES if s in parts}
         return MappingProxyType({s: entry for s, entry in found.items() if entry is not None})
+
+    def damaged(self) -> tuple[str, ...]:
+        """Stages that the manifest names, but not as this program wrote it."""
+        named, whole = self._parts(), self.entries()
+        return tuple(
+            stage
+            for stage in TABLES
+            if stage in named and stage not in whole and not (self.folder / stage).is_symlink()
+        )
 
     def raw_files(self) -> Mapping[str, Facts]:
         """Files of the raw folder as the last run described them."""
-        return _files(read_json(self.folder / MANIFEST).get("raw")) or MappingProxyType({})
+        return _files(self._parts().get("raw")) or MappingProxyType({})
 
     def begin(self, stage: str, fingerprint: str) -> Path:
-        """Make an empty folder for the stage to write to."""
-        temporary = self.folder / stage / f".{fingerprint}.tmp-{os.getpid()}"
-        remove_own(temporary, _is_own)
-        temporary.mkdir(parents=True)
-        return temporary
+        """Make an empty folder for the stage to write to.
+
+        Raises
+        ------
+        PseError
+            If something else stands where the stage's folder or the manifest belongs.
+        """
+        refuse_foreign(self.folder / MANIFEST)
+        folder = self.folder / stage
+        if os.path.lexists(folder) and (folder.is_symlink() or not folder.is_dir()):
+            raise CacheError(
+                f"{folder}: expected a folder of this program, received a link or a file: move it "
+                f"away; to keep results elsewhere, make {self.folder} as a whole a link"
+            )
+        part = temporary(folder / fingerprint)
+        part.mkdir(parents=True)
+        return part
 
     def publish(self, stage: str, entry: Entry) -> Entry:
         """Make a written folder the stage's current result, then remove what it replaces.
@@ -204,30 +261,23 @@ class Store:
             The result, with the folder of `begin`; its files are described here.
         """
         flush_folder(entry.folder)
-        files = describe_folder(entry.folder)
-        final = self._free(stage, entry.fingerprint)
+        files = describe_folder(entry.folder, asked=partial(is_own, stage))
+        # A forced run repeats a fingerprint, and the current folder must stay until the manifest
+        # no longer names it.
+        final = free(self.folder / stage / entry.fingerprint, "-")
         os.rename(entry.folder, final)
         flush(final.parent)
-        self._write({stage: _facts(entry, final.name, files)})
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        done = replace(entry, folder=final, files=MappingProxyType(files), finished=now)
+        self._write({**self.entries(), stage: done}, self.raw_files())
         self.prune()
-        return Entry(**{**vars(entry), "folder": final, "files": MappingProxyType(files)})
+        return done
 
-    def _free(self, stage: str, fingerprint: str) -> Path:
-        """Return a folder that is not there yet.
-
-        A forced run repeats a fingerprint, and the current folder must stay until the manifest no
-        longer names it.
-        """
-        final, number = self.folder / stage / fingerprint, 1
-        while os.path.lexists(final):
-            number += 1
-            final = final.with_name(f"{fingerprint}-{number}")
-        return final
-
-    def _write(self, stages: Mapping[str, Any], raw: Mapping[str, Facts] | None = None) -> None:
-        known = {name: facts for name, facts in self._stages().items() if name in STAGES}
-        files = self.raw_files() if raw is None else raw
-        value = {"version": VERSION, "raw": dict(files), "stages": {**known, **stages}}
+    def _write(self, entries: Mapping[str, Entry], raw: Mapping[str, Facts]) -> None:
+        stages = {stage: _facts(entry) for stage, entry in entries.items()}
+        files = {name: dict(facts) for name, facts in raw.items()}
+        seals = {name: seal(part) for name, part in {**stages, "raw": files}.items()}
+        value = {"version": VERSION, "raw": files, "stages": stages, "seals": seals}
         write_json(self.folder / MANIFEST, value)
 
     def note(self, raw: Mapping[str, Facts], entries: Mapping[str, Entry]) -> None:
@@ -240,15 +290,10 @@ class Store:
         entries
             Stages whose files are as they were written.
         """
-        stages = self._stages()
-        changed = dict(raw) != dict(self.raw_files())
-        for stage, entry in entries.items():
-            files = describe_folder(entry.folder, entry.files)
-            kept = {name: files.get(name, facts) for name, facts in entry.files.items()}
-            changed |= kept != dict(entry.files)
-            stages[stage] = {**stages[stage], "files": kept}
-        if changed:
-            self._write(stages, raw)
+        before = self.entries()
+        now = {s: replace(e, files=refresh(e.folder, e.files)) for s, e in entries.items()}
+        if any(now[s] != before.get(s) for s in now) or dict(raw) != dict(self.raw_files()):
+            self._write({**before, **now}, raw)
 
     def prune(self) -> None:
         """Remove results that the manifest does not name, those of interrupted runs included.
@@ -257,30 +302,33 @@ class Store:
         the case's `lock` only: otherwise a temporary folder may be another run's.
         """
         kept = {entry.folder for entry in self.entries().values()}
-        for path in self.folder.glob(f".{MANIFEST}.tmp-*"):
-            if is_orphan(path) and not path.is_symlink():
-                path.unlink()
-        for stage in STAGES:
+        for path in orphans(self.folder / MANIFEST):
+            remove_file(path)
+        for stage in TABLES:
             folder = self.folder / stage
             if folder.is_symlink() or not folder.is_dir():
                 continue
             for path in folder.iterdir():
                 shaped = _FOLDER.fullmatch(path.name) or _TEMPORARY.fullmatch(path.name)
                 if shaped and path not in kept:
-                    remove_own(path, _is_own)
+                    remove_own(path, partial(is_own, stage))
 
 
-def _is_own(name: str) -> bool:
-    return _OWN.fullmatch(name) is not None
+def is_own(stage: str, name: str) -> bool:
+    """Whether a stage writes a file of that name into its folder."""
+    if name in (f"{stage}.rrd", SUMMARY):
+        return name != SUMMARY or stage == "score"
+    match = re.fullmatch(r"([a-z]+)(-\d+-\d+)?\.parquet", name)
+    return match is not None and match[1] in TABLES[stage]
 
 
-def _facts(entry: Entry, folder: str, files: Mapping[str, Facts]) -> dict[str, Any]:
+def _facts(entry: Entry) -> dict[str, Any]:
     return {
         "fingerprint": entry.fingerprint,
-        "folder": folder,
-        "files": dict(files),
-        "seconds": round(entry.seconds, 3),
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "folder": entry.folder.name,
+        "files": {name: dict(facts) for name, facts in entry.files.items()},
+        "seconds": float(round(entry.seconds, 3)),
+        "finished": entry.finished,
         "parameters": dict(entry.parameters),
         "inputs": dict(entry.inputs),
     }

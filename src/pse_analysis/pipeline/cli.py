@@ -9,16 +9,14 @@ import argparse
 import os
 import signal
 import sys
-import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pse_analysis.errors import ParameterError, PseError, TableError, remedy
 from pse_analysis.files import check
-from pse_analysis.pipeline import memory, runner, viewer
+from pse_analysis.pipeline import endings, memory, runner, viewer
 from pse_analysis.pipeline.case import Case, list_cases, load_case, project_root
 from pse_analysis.pipeline.plan import NAMES, THREADS, Options, Reporter, Result, again
 from pse_analysis.pipeline.results import stored
@@ -26,18 +24,6 @@ from pse_analysis.pipeline.verify import verify
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
-
-INTERRUPTED = 130
-ENDINGS = {signal.SIGTERM: 143, signal.SIGHUP: 129}
-"""Signals that ask the program to end, and its exit code then."""
-
-
-class Ended(BaseException):
-    """A signal asked the program to end; not an error that a stage could outlive."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = signal.Signals(number)
 
 
 class Lines(Reporter):
@@ -49,7 +35,16 @@ class Lines(Reporter):
 
     def cached(self, stage: str) -> None:
         """Print that nothing had to be done."""
+        endings.check()
         print(f"  {stage:<9} cached", flush=True)
+
+    def started(self, stage: str) -> None:
+        """Go on unless a signal came."""
+        endings.check()
+
+    def progress(self, stage: str, done: int, total: int, note: str) -> None:
+        """Go on unless a signal came."""
+        endings.check()
 
     def finished(self, stage: str, seconds: float) -> None:
         """Print how long it took."""
@@ -80,6 +75,7 @@ class Bars(Lines):
 
     def started(self, stage: str) -> None:
         """Draw an empty bar."""
+        super().started(stage)
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
         self._progress = Progress(
@@ -93,6 +89,7 @@ class Bars(Lines):
 
     def progress(self, stage: str, done: int, total: int, note: str) -> None:
         """Move the bar."""
+        super().progress(stage, done, total, note)
         if self._progress is not None and self._task is not None:
             self._progress.update(self._task, completed=done, total=total, description=note)
 
@@ -132,7 +129,7 @@ def places(result: Result) -> list[tuple[str, str]]:
 
 def _near(path: Path) -> Path:
     """The path from the working folder if it is below it."""
-    absolute = path.resolve()
+    absolute = Path(os.path.realpath(path))
     here = Path.cwd().resolve()
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
@@ -144,31 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
-    with ending_by_signal():
-        return _guarded(parser().parse_args(arguments))
-
-
-@contextmanager
-def ending_by_signal() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise `Ended`, so that temporary folders are removed on the way out.
-
-    One that is ignored, as ``nohup`` does with SIGHUP, stays ignored.
-    """
-    before = {}
-
-    def end(number: int, _: object) -> None:
-        raise Ended(number)
-
-    # Only the main thread may say what a signal does.
-    if threading.current_thread() is threading.main_thread():
-        for number in ENDINGS:
-            if signal.getsignal(number) is signal.SIG_DFL:
-                before[number] = signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with endings.by_signal():
+        return _guarded(arguments)
 
 
 def _open_closed_streams() -> None:
@@ -247,28 +221,30 @@ def _add_folders(parser: argparse.ArgumentParser) -> None:
     _add_cases(parser)
 
 
-def _guarded(options: argparse.Namespace) -> int:
-    command: Callable[[argparse.Namespace], int] = options.command
+def _guarded(arguments: Sequence[str] | None) -> int:
     try:
-        return command(options)
-    except KeyboardInterrupt:
-        print("\ninterrupted: finished stages are kept, the next run goes on", file=sys.stderr)
-        return INTERRUPTED
-    except Ended as ended:
-        print(
-            f"\nended by {ended.number.name}: finished stages are kept, the next run goes on",
-            file=sys.stderr,
-        )
-        return ENDINGS[ended.number]
+        options = parser().parse_args(arguments)
+        command: Callable[[argparse.Namespace], int] = options.command
+        try:
+            code = command(options)
+        except BrokenPipeError:
+            raise
+        except Exception as error:
+            code = _explain(error, options.debug)
+        endings.check()
+        return code
+    except (endings.Ended, KeyboardInterrupt) as reason:
+        ended = endings.Ended(signal.SIGINT) if isinstance(reason, KeyboardInterrupt) else reason
+        print(f"\n{ended}", file=sys.stderr)
+        return ended.code
     except BrokenPipeError:
         # Whoever read the output, for example `head`, has seen enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except Exception as error:
-        return _explain(error, options.debug)
 
 
 def _explain(error: Exception, debug: bool) -> int:
+    endings.check()
     sys.stdout.flush()
     if debug:
         traceback.print_exception(error)
@@ -338,11 +314,11 @@ def _view(options: argparse.Namespace) -> int:
     case = load_case(options.case, options.cases)
     wanted = Options(data=options.data, cases=options.cases)
     folder = wanted.data_folder / "processed" / case.name
-    entries, older = stored(case, wanted)
+    entries, older, _ = stored(case, wanted)
     shown = {s: e for s, e in entries.items() if options.older or s not in older}
     result = Result(case, wanted.data_folder / "raw" / case.name, shown)
     for stage in (stage for stage in entries if stage in older):
-        told = "is older" if options.older else "is left out, because it is older"
+        told = "is older" if options.older else "is left out, because it is older or damaged"
         print(f"{stage} {told}: {older[stage]}", file=sys.stderr)
     if not result.recordings:
         raise TableError(

@@ -153,4 +153,6 @@ def fingerprint(
             "code": dict(code),
         }
     )
-    return hashlib.blake2b(text.encode(), digest_size=FINGERPRINT_BYTES).hexdigest()
+    # Names of files need not be UTF-8.
+    content = text.encode("utf-8", "surrogatepass")
+    return hashlib.blake2b(content, digest_size=FINGERPRINT_BYTES).hexdigest()

@@ -14,11 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.files import check
-from pse_analysis.pipeline.cache import Entry
+from pse_analysis.files import Facts, check
+from pse_analysis.pipeline.cache import SUMMARY, Entry
 from pse_analysis.pipeline.case import Case, project_root
-
-SUMMARY = "summary.txt"
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """What the BLAS libraries read, when numpy is imported, to learn how many threads to start."""
@@ -260,6 +258,8 @@ class Result:
         Stages that ran, and stages whose results were current.
     older : mapping of str to str
         Stages whose stored result does not descend from the current ones, and why.
+    raw_files : mapping of str to mapping
+        Description of the raw folder's tables that the results descend from, by name.
     """
 
     case: Case
@@ -268,6 +268,7 @@ class Result:
     ran: tuple[str, ...] = ()
     cached: tuple[str, ...] = ()
     older: Mapping[str, str] = field(default_factory=dict)
+    raw_files: Mapping[str, Facts] = field(default_factory=dict)
 
     @property
     def recordings(self) -> tuple[Path, ...]:

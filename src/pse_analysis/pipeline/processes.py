@@ -9,10 +9,16 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
 from pse_analysis.errors import OutOfMemory
+from pse_analysis.pipeline.endings import CODES
 from pse_analysis.pipeline.plan import THREADS
+
+PATIENCE_S = 5.0
+"""How long a process may take to end when it is asked to. [s]"""
 
 Task = TypeVar("Task")
 Done = TypeVar("Done")
@@ -45,11 +51,14 @@ def each(function: Callable[[Task], Done], tasks: Sequence[Task], workers: int) 
     threads = dict.fromkeys(THREADS, "1")
     before = {name: os.environ.get(name) for name in threads}
     os.environ.update(threads)
+    others = multiprocessing.active_children()
     pool = ProcessPoolExecutor(
         workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
     )
     try:
-        for future in as_completed([pool.submit(function, task) for task in tasks]):
+        with _signals_waiting():
+            futures = [pool.submit(function, task) for task in tasks]
+        for future in as_completed(futures):
             yield future.result()
         pool.shutdown()
     except BrokenProcessPool as error:
@@ -58,13 +67,10 @@ def each(function: Callable[[Task], Done], tasks: Sequence[Task], workers: int) 
             f"memory runs out: run again with fewer of them (--workers 1, now {workers}), or with "
             "a shorter [study] or history_s, fewer trials, fewer methods"
         ) from error
-    except BaseException:
+    finally:
         # Do not wait for estimates that nobody will read.
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-    finally:
+        _end([child for child in multiprocessing.active_children() if child not in others])
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -72,9 +78,33 @@ def each(function: Callable[[Task], Done], tasks: Sequence[Task], workers: int) 
                 os.environ[name] = value
 
 
+@contextmanager
+def _signals_waiting() -> Iterator[None]:
+    """Let signals wait while processes are started: cut short, a start leaves one astray.
+
+    The processes inherit that, so that Ctrl-C does not meet them before they can tell it apart.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, CODES)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end(processes: Sequence[BaseProcess]) -> None:
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.join(PATIENCE_S)
+        if process.is_alive():
+            process.kill()
+            process.join()
+
+
 def _begin_worker() -> None:
     # Ctrl-C is for the runner, which ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, CODES)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -6,35 +6,42 @@ Standard library only.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import re
+import stat
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pse_analysis.checksums import (
+    CHECKSUMS,
+    RAW,
+    SIMULATED,
+    is_own,
+    is_raw_table,
+    may_be_read,
+    read_checksums,
+    refuse_links,
+    remedy,
+    write_checksums,
+)
 from pse_analysis.errors import DamagedFile
 from pse_analysis.files import (
-    CHECKSUMS,
-    SIMULATED,
     Facts,
-    accept,
     describe_folder,
+    files_below,
     flush,
     flush_folder,
-    is_orphan,
-    read_checksums,
     read_json,
-    refuse_links,
-    remove_own,
-    write_checksums,
+    real,
     write_json,
 )
+from pse_analysis.leftovers import free, orphans, remove_empty, remove_own, temporary
 from pse_analysis.pipeline.cache import CacheError
-from pse_analysis.pipeline.plan import STAGES
 
-READ = frozenset(name for stage in STAGES for name in stage.raw)
-"""Files and folders in it that stages read."""
 
-_LISTS = (SIMULATED, CHECKSUMS)
+def _silent(_: str) -> None:
+    """Keep a warning to itself."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +50,25 @@ class RawFolder:
 
     A folder without that marker belongs to the user and is never written to. If the folder is a
     link, data are read and written where it leads.
+
+    Attributes
+    ----------
+    folder : Path
+        Where it is.
+    warn : callable
+        Is told of files that had to be put elsewhere.
     """
 
     folder: Path
+    warn: Callable[[str], None] = _silent
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "folder", self.folder.resolve())
-
-    @property
-    def _old(self) -> Path:
-        return self.folder.with_name(f".{self.folder.name}.old")
+        object.__setattr__(self, "folder", real(self.folder))
+        if os.path.lexists(self.folder) and not self.folder.is_dir():
+            raise CacheError(
+                f"{self.folder}: expected the folder of the case's raw data, received a file: "
+                "move it away"
+            )
 
     @property
     def occupied(self) -> bool:
@@ -61,38 +77,52 @@ class RawFolder:
 
     def recover(self) -> None:
         """Finish or undo a swap that was interrupted; call it under the case's `lock`."""
-        if self._old.is_symlink():
-            # An earlier version moved a linked folder's link aside and could not go on.
-            self._old.unlink()
-        elif self._old.exists():
+        for old in self._replaced():
             if self.folder.exists():
-                self._retire()
+                self._retire(old)
             else:
-                os.rename(self._old, self.folder)
-        if self.folder.parent.is_dir():
-            for path in list(self.folder.parent.iterdir()):
-                if path.name.startswith(f".{self.folder.name}.tmp-") and is_orphan(path):
-                    remove_own(path, _is_raw)
+                os.rename(old, self.folder)
+        for orphan in orphans(self.folder):
+            remove_own(orphan, is_own)
+
+    def _replaced(self) -> list[Path]:
+        """Folders that a swap has put aside."""
+        name = re.compile(rf"\.{re.escape(self.folder.name)}\.tmp-\d+(-\d+)?\.old(-\d+)?")
+        beside = list(self.folder.parent.iterdir()) if self.folder.parent.is_dir() else []
+        return [p for p in beside if name.fullmatch(p.name) and p.is_dir() and not p.is_symlink()]
 
     def describe(self, known: Mapping[str, Facts] | None = None) -> dict[str, dict[str, Any]]:
-        """Description of the files that stages read, `pse_analysis.files.describe_folder`.
+        """Description of the tables that stages read, `pse_analysis.files.describe_folder`.
+
+        Parameters
+        ----------
+        known
+            Earlier descriptions; where they contradict the list of checksums, files are read.
 
         Raises
         ------
         TableError
-            If a link leads out of the folder.
+            If a link leads out of the folder, or a file cannot be read.
         """
-        refuse_links(self.folder, READ)
-        files = describe_folder(self.folder, known)
-        return {name: facts for name, facts in files.items() if name.split("/")[0] in READ}
+        refuse_links(self.folder)
+        try:
+            listed = read_checksums(self.folder)
+        except DamagedFile:
+            listed = {}
+        agreed = {
+            name: facts
+            for name, facts in (known or {}).items()
+            if _alike(listed.get(name, facts), facts)
+        }
+        return describe_folder(self.folder, agreed, asked=is_raw_table)
 
     def marker(self) -> Mapping[str, Any] | None:
         """What the simulation noted about itself; None if it did not make this folder."""
         path = self.folder / SIMULATED
-        return read_json(path) if path.is_file() else None
+        return read_json(path) if path.is_file() and not path.is_symlink() else None
 
     def changed(self, files: Mapping[str, Facts]) -> str | None:
-        """First file that is not as it was written, or was added; None if there is none.
+        """First table that is not as it was written, or was added; None if there is none.
 
         Parameters
         ----------
@@ -100,99 +130,124 @@ class RawFolder:
             What is there, from `describe`.
         """
         try:
-            written = read_checksums(self.folder)
+            written = _tables(read_checksums(self.folder))
         except DamagedFile:
             return CHECKSUMS
+        if not written:
+            return CHECKSUMS
         for name in sorted(set(written) | set(files)):
-            if written.get(name, {}).get("digest") != files.get(name, {}).get("digest"):
+            if not _alike(written.get(name), files.get(name)):
                 return name
         return None
 
     def check(self, files: Mapping[str, Facts]) -> None:
-        """Refuse files of the user that differ from their checksums; new files are welcome.
+        """Refuse tables of the user that differ from their checksums; new ones are welcome.
 
         Raises
         ------
         DamagedFile
             With the first file, and how to accept it.
         """
-        for name, facts in read_checksums(self.folder).items():
+        for name, facts in _tables(read_checksums(self.folder)).items():
             if name not in files:
-                raise DamagedFile(f"{self.folder / name} is gone: {accept(self.folder)}")
-            if facts["digest"] != files[name]["digest"]:
+                raise DamagedFile(f"{self.folder / name} is gone: {remedy(self.folder)}")
+            if not _alike(facts, files[name]):
                 raise DamagedFile(
                     f"{self.folder / name} is not as it was written; it was damaged or changed: "
-                    f"{accept(self.folder)}"
+                    f"{remedy(self.folder)}"
                 )
 
     def begin(self) -> Path:
         """Make an empty sibling folder for the simulation to write to."""
-        temporary = self.folder.with_name(f".{self.folder.name}.tmp-{os.getpid()}")
-        remove_own(temporary, _is_raw)
-        temporary.mkdir(parents=True)
-        return temporary
+        part = temporary(self.folder)
+        part.mkdir(parents=True)
+        return part
 
-    def publish(
-        self,
-        fingerprint: str,
-        parameters: Mapping[str, str],
-        temporary: Path,
-        seconds: float,
-    ) -> None:
-        """Swap a written folder in by two renames; `recover` knows how to finish them."""
+    def publish(self, marker: Mapping[str, Any], part: Path) -> None:
+        """Swap a written folder in by two renames; `recover` knows how to finish them.
+
+        Parameters
+        ----------
+        marker
+            What the simulation notes about itself.
+        part
+            The folder of `begin`.
+        """
         if self.occupied and self.marker() is None:
             raise CacheError(foreign(self.folder))
-        write_checksums(temporary)
-        marker = {
-            "fingerprint": fingerprint,
-            "parameters": dict(parameters),
-            "seconds": round(seconds, 3),
-        }
-        write_json(temporary / SIMULATED, marker)
-        flush_folder(temporary)
+        write_checksums(part)
+        # Named twice, so that damage to one of the lists does not make them somebody else's.
+        names = sorted(read_checksums(part))
+        write_json(part / SIMULATED, {**marker, "tables": names})
+        flush_folder(part)
+        old = free(part.with_name(f"{part.name}.old"), "-")
         if self.folder.exists():
-            os.rename(self.folder, self._old)
-        os.rename(temporary, self.folder)
+            os.rename(self.folder, old)
+        os.rename(part, self.folder)
         flush(self.folder.parent)
-        if self._old.exists():
-            self._retire()
+        if old.exists():
+            self._retire(old)
 
-    def _retire(self) -> None:
-        """Remove what a simulation wrote into the old folder; what others put there stays.
+    def _retire(self, old: Path) -> None:
+        """Remove what a simulation wrote into a replaced folder; what others put there stays.
 
         It returns to its place; a table of theirs would be read as part of the new case, and is
         kept beside the folder instead.
         """
-        written = read_json(self._old / CHECKSUMS).get("files")
-        own = {*_LISTS, *(written if isinstance(written, dict) else ())}
-        remove_own(self._old, own.__contains__)
+        listed = read_json(old / CHECKSUMS).get("files"), read_json(old / SIMULATED).get("tables")
+        tables = {n for names in listed if isinstance(names, dict | list) for n in map(str, names)}
+        # The lists go last: without them, an interrupted removal could not go on.
+        if remove_own(old, lambda name: is_own(name) and (name in tables or name.endswith("/"))):
+            return
         kept = self.folder.with_name(f"{self.folder.name}.kept")
-        for path in list(_left(self._old)):
-            name = path.relative_to(self._old)
+        if os.path.lexists(kept) and (kept.is_symlink() or not kept.is_dir()):
+            kept = free(kept, ".")
+        if count := self._put_back(old, old, kept):
+            self.warn(
+                f"what the simulation had not written into {self.folder} ({count} files or "
+                f"folders) lies in {kept} now, so that it is not taken for part of the new one"
+            )
+        remove_own(old, is_own)
+
+    def _put_back(self, old: Path, folder: Path, kept: Path) -> int:
+        """Move what lies in a folder below ``old`` to its place; returns how many were kept."""
+        count = 0
+        for path in list(folder.iterdir()):
+            name = path.relative_to(old)
+            if name.as_posix() in (SIMULATED, CHECKSUMS) and stat.S_ISREG(path.lstat().st_mode):
+                continue
+            if path.is_dir() and not path.is_symlink() and is_own(f"{name.as_posix()}/"):
+                count += self._put_back(old, path, kept)
+                remove_empty(path)
+                continue
             target = self.folder / name
-            if name.parts[0] in READ or os.path.lexists(target):
-                target = _free(kept / name)
+            aside = _would_be_read(path, name) or os.path.lexists(target)
+            if aside:
+                target = free(kept / name, ".")
+                count += 1
             target.parent.mkdir(parents=True, exist_ok=True)
             os.rename(path, target)
-        remove_own(self._old, own.__contains__)
+        return count
 
 
-def _left(folder: Path) -> Iterator[Path]:
-    for root, folders, names in os.walk(folder):
-        yield from (Path(root, name) for name in names)
-        yield from (path for name in folders if (path := Path(root, name)).is_symlink())
+def _alike(one: Facts | None, other: Facts | None) -> bool:
+    """Whether two descriptions are of the same content."""
+    if one is None or other is None:
+        return False
+    return bool(one["bytes"] == other["bytes"] and one["digest"] == other["digest"])
 
 
-def _free(path: Path) -> Path:
-    free, number = path, 1
-    while os.path.lexists(free):
-        number += 1
-        free = path.with_name(f"{path.name}.{number}")
-    return free
+def _tables(listed: Mapping[str, Facts]) -> dict[str, Facts]:
+    return {name: facts for name, facts in listed.items() if is_raw_table(name)}
 
 
-def _is_raw(name: str) -> bool:
-    return name in _LISTS or name.split("/")[0] in READ
+def _would_be_read(path: Path, name: Path) -> bool:
+    """Whether a file or folder would be read, or a link be refused, as part of a case."""
+    if name.parts[0] not in RAW:
+        return False
+    if path.is_dir() and not path.is_symlink():
+        return any(p.suffix == ".parquet" for p in files_below(path))
+    return len(name.parts) == 1 or may_be_read(path.name)
 
 
 def foreign(folder: Path) -> str:

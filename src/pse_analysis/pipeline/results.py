@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pse_analysis.pipeline.stages import Parameters
 
 RAW_TABLES = ("telemetry", "channels", "truth", "sample_truth", "faults")
+MODEL = ("grid", "machine.parquet")
 
 
 class Recordings(Mapping[str, Path]):
@@ -63,20 +64,20 @@ class Results(Mapping[str, "pd.DataFrame"]):
         Parquet file of each processed table.
     recordings : mapping of str to Path
         Rerun recording of each stage that has one.
-    summary : str
-        The table of scores as text; empty before the case is scored.
     older : mapping of str to str
         Stages whose stored result does not descend from the case file and the other results as
-        they are now, and why. Their tables are left out, unless `load` was asked for them.
+        they are now, or is damaged, and why. Their tables are left out, unless `load` was asked
+        for them.
     """
 
     case: Case
     raw_folder: Path
     files: Mapping[str, Path]
     recordings: Mapping[str, Path]
-    summary: str
     older: Mapping[str, str] = field(default_factory=dict)
+    _score: Entry | None = field(default=None, repr=False, compare=False)
     _facts: Mapping[str, Facts] = field(default_factory=dict, repr=False, compare=False)
+    _raw_files: Mapping[str, Facts] = field(default_factory=dict, repr=False, compare=False)
     _hidden: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, pd.DataFrame] = field(default_factory=dict, repr=False, compare=False)
 
@@ -85,6 +86,7 @@ class Results(Mapping[str, "pd.DataFrame"]):
         """The grid."""
         from pse_analysis.pipeline.tables import read_network
 
+        self._check_raw(*MODEL)
         return read_network(self.raw_folder)
 
     @property
@@ -92,6 +94,7 @@ class Results(Mapping[str, "pd.DataFrame"]):
         """The machine."""
         from pse_analysis.pipeline.tables import read_machine
 
+        self._check_raw(*MODEL)
         return read_machine(self.raw_folder)
 
     @property
@@ -101,6 +104,12 @@ class Results(Mapping[str, "pd.DataFrame"]):
 
         return check_case(self.case)
 
+    @property
+    def summary(self) -> str:
+        """The table of scores as text; empty before the case is scored."""
+        scored = {} if self._score is None else {"score": self._score}
+        return Result(self.case, self.raw_folder, scored).summary
+
     def __getitem__(self, table: str) -> pd.DataFrame:
         if table not in self._read:
             from pse_analysis.pipeline.tables import find_raw_table
@@ -108,8 +117,8 @@ class Results(Mapping[str, "pd.DataFrame"]):
 
             if table in self._hidden:
                 raise TableError(
-                    f"{table} is older than what it was made from ({self._hidden[table]}): "
-                    f"`pse run {self.case.name}` brings it up to date, "
+                    f"{table} is older than what it was made from, or damaged "
+                    f"({self._hidden[table]}): `pse run {self.case.name}` brings it up to date, "
                     f"load({self.case.name!r}, older=True) shows it as it is"
                 )
             if table not in set(self):
@@ -122,11 +131,23 @@ class Results(Mapping[str, "pd.DataFrame"]):
                 check(self.files[table], self._facts[table], again(self.case.name))
                 frame = read_table(self.files[table], table)
             else:
+                self._check_raw(table, f"{table}.parquet")
                 found = find_raw_table(self.raw_folder, table)
                 assert found is not None
                 frame = found
             self._read[table] = frame
         return self._read[table]
+
+    def _check_raw(self, *names: str) -> None:
+        """Refuse raw files that are not those which the other tables were made from."""
+        now = RawFolder(self.raw_folder).describe(self._raw_files)
+        for name in sorted({*now, *self._raw_files}):
+            digests = {files.get(name, {}).get("digest") for files in (now, self._raw_files)}
+            if name.split("/")[0] in names and len(digests) > 1:
+                raise TableError(
+                    f"{self.raw_folder / name} is not as it was when the case was loaded: load "
+                    "the case again"
+                )
 
     def __iter__(self) -> Iterator[str]:
         yield from (n for n in RAW_TABLES if n not in self._hidden and self._in_raw(n))
@@ -146,6 +167,7 @@ def _results(
     raw_folder: Path,
     entries: Mapping[str, Entry],
     older: Mapping[str, str],
+    raw_files: Mapping[str, Facts],
     shown: bool = False,
 ) -> Results:
     """Results of the given entries; without those that are older, unless they are to be shown."""
@@ -164,15 +186,15 @@ def _results(
                 tables[table] = found
             elif name.endswith(".rrd") and stage not in hidden:
                 recordings[stage] = found
-    current = {stage: entry for stage, entry in entries.items() if stage not in hidden}
     return Results(
         case=case,
         raw_folder=raw_folder,
         files=MappingProxyType({table: path for table, (path, _) in tables.items()}),
         recordings=Recordings(case.name, recordings),
-        summary=Result(case, raw_folder, current).summary,
         older=MappingProxyType(dict(older)),
+        _score=None if "score" in hidden else entries.get("score"),
         _facts={table: facts for table, (_, facts) in tables.items()},
+        _raw_files=raw_files,
         _hidden=left_out,
     )
 
@@ -208,7 +230,7 @@ def load(
     options = Options(data=_path(data), cases=_path(cases))
     found = load_case(case, options.cases)
     folder = options.data_folder / "processed" / found.name
-    entries, outdated = stored(found, options)
+    entries, outdated, raw_files = stored(found, options)
     if not entries:
         raise TableError(
             f"case {case!r} has no results in {folder}: run it first, with `pse run {case}` or "
@@ -217,21 +239,28 @@ def load(
     if not older and set(entries) <= set(outdated):
         stage = next(iter(outdated))
         raise TableError(
-            f"all results of case {case!r} in {folder} are older than what they were made from "
-            f"({stage}: {outdated[stage]}): `pse run {case}` brings them up to date, "
+            f"all results of case {case!r} in {folder} are older than what they were made from, or "
+            f"damaged ({stage}: {outdated[stage]}): `pse run {case}` brings them up to date, "
             f"load({case!r}, older=True) shows them as they are"
         )
     raw_folder = options.data_folder / "raw" / found.name
-    return _results(found, raw_folder, entries, outdated, shown=older)
+    return _results(found, raw_folder, entries, outdated, raw_files, shown=older)
 
 
-def stored(case: Case, options: Options) -> tuple[dict[str, Entry], dict[str, str]]:
-    """Whole results of a case by stage, and which of them are older than the rest, and why."""
+def stored(
+    case: Case, options: Options
+) -> tuple[dict[str, Entry], dict[str, str], Mapping[str, Facts]]:
+    """Results of a case by stage; which are older than the rest, or damaged, and why; raw files."""
     store = Store(options.data_folder / "processed" / case.name)
-    entries = {name: entry for name, entry in store.entries().items() if not entry.damaged()}
+    entries = dict(store.entries())
     raw = RawFolder(options.data_folder / "raw" / case.name)
     files = raw.describe(store.raw_files()) if raw.occupied else {}
-    return entries, descent.older(case, entries, files, raw.marker())
+    read = descent.simulation_inputs(case, options.data_folder)
+    unfit = descent.older(case, entries, files, raw.marker(), read)
+    for stage, entry in entries.items():
+        if names := entry.damaged():
+            unfit[stage] = f"{entry.folder / names[0]} is gone, damaged or changed since written"
+    return entries, unfit, files
 
 
 def run(
@@ -270,7 +299,7 @@ def run(
         until=until, force=force, workers=workers, data=_path(data), cases=_path(cases)
     )
     result = runner.run(case, options, reporter)
-    return _results(result.case, result.raw, result.entries, result.older)
+    return _results(result.case, result.raw, result.entries, result.older, result.raw_files)
 
 
 def _path(path: str | Path | None) -> Path | None:

@@ -16,12 +16,14 @@ from pse_analysis import recording
 from pse_analysis.alignment import AlignParams, align
 from pse_analysis.errors import ParameterError, PseError
 from pse_analysis.estimation import EstimateParams, Method, estimate
+from pse_analysis.files import Facts, check, describe
 from pse_analysis.grid import library
 from pse_analysis.machine import Machine
 from pse_analysis.parameters import Study, build
 from pse_analysis.pipeline import account
+from pse_analysis.pipeline.cache import SUMMARY
 from pse_analysis.pipeline.case import Case
-from pse_analysis.pipeline.plan import SUMMARY, Job, Work
+from pse_analysis.pipeline.plan import Job, Work
 from pse_analysis.pipeline.processes import each
 from pse_analysis.pipeline.summary import markdown, text
 from pse_analysis.pipeline.tables import find_raw_table
@@ -210,8 +212,8 @@ class EstimateTask:
         return self.output / f"{table}-{self.number:03d}-{self.trial:05d}.parquet"
 
 
-def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
-    """Run one method on one trial; returns the file of each table."""
+def run_estimate_task(task: EstimateTask) -> dict[Path, Facts]:
+    """Run one method on one trial; returns what was written, as `pse_analysis.files.describe`."""
     # Other trials stay on the disk; which variant to take is the method's business.
     aligned = read_rows(task.aligned, "aligned", trial=task.trial)
     try:
@@ -228,7 +230,7 @@ def run_estimate_task(task: EstimateTask) -> dict[str, Path]:
         raise type(error)(f"method {task.method.name!r}: {error}") from error
     for table in PARTS:
         write_table(task.part(table), getattr(done, table), table)
-    return {table: task.part(table) for table in PARTS}
+    return {task.part(table): describe(task.part(table)) for table in PARTS}
 
 
 def _estimate(job: Job) -> None:
@@ -246,10 +248,14 @@ def _estimate(job: Job) -> None:
     ]
     total = len(tasks) + 1
     job.progress(0, total, f"0 of {len(tasks)} estimates")
-    for done, _ in enumerate(each(run_estimate_task, tasks, job.workers), 1):
+    written: dict[Path, Facts] = {}
+    for done, files in enumerate(each(run_estimate_task, tasks, job.workers), 1):
+        written.update(files)
         job.progress(done, total, f"{done} of {len(tasks)} estimates")
     for table in PARTS:
         parts = [task.part(table) for task in tasks]
+        for part in parts:
+            check(part, written[part], f"`pse run {job.case.name}` makes it again")
         merge_files(parts, job.output / f"{table}.parquet", table, job.provenance)
     job.progress(len(tasks), total, "recording")
     tables = {name: read_table(job.output / f"{name}.parquet", name) for name in PARTS}

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pse_analysis.checksums import CHECKSUMS, is_raw_table, read_checksums, remedy
 from pse_analysis.errors import DamagedFile, PseError
-from pse_analysis.files import CHECKSUMS, SIMULATED, Facts, files_below, read_checksums, unchanged
+from pse_analysis.files import Facts, files_below, unchanged
 from pse_analysis.pipeline.cache import MANIFEST, Entry, Store
 from pse_analysis.pipeline.case import Case
-from pse_analysis.pipeline.descent import older
-from pse_analysis.pipeline.plan import NAMES, Options
+from pse_analysis.pipeline.descent import older, simulation_inputs
+from pse_analysis.pipeline.plan import Options
 from pse_analysis.pipeline.raw_folder import RawFolder
 
 
@@ -52,17 +54,20 @@ def verify(case: Case, options: Options) -> tuple[int, list[Finding]]:
     entries = store.entries()
     found = list(_raw(raw))
     count = len(_listed(raw))
-    manifest = store.folder / MANIFEST
-    for stage in NAMES[1:]:
-        if stage in entries:
-            count += len(entries[stage].files)
-            found += _stage(case, stage, entries[stage])
-    if manifest.exists() and not entries:
-        found.append(
-            Finding(manifest, f"names no result: `pse run {case.name}` makes them again", True)
-        )
-    files = raw.describe() if raw.occupied else {}
-    for stage, why in older(case, entries, files, raw.marker()).items():
+    for stage, entry in entries.items():
+        count += len(entry.files)
+        found += _stage(case, stage, entry)
+    manifest, again = store.folder / MANIFEST, f"`pse run {case.name}` makes it again"
+    for stage in store.damaged():
+        found.append(Finding(manifest, f"{stage}: its part was damaged or changed: {again}", True))
+    if os.path.lexists(manifest) and not entries and not store.damaged():
+        found.append(Finding(manifest, f"names no result: {again}", True))
+    try:
+        files = raw.describe() if raw.occupied else {}
+    except PseError as error:
+        return count, [*found, Finding(raw.folder, str(error), True)]
+    read = simulation_inputs(case, options.data_folder)
+    for stage, why in older(case, entries, files, raw.marker(), read).items():
         place = raw.folder if stage == "simulate" else entries[stage].folder
         found.append(Finding(place, f"older: {why}; `pse run {case.name}` makes it anew", False))
     return count, found
@@ -84,24 +89,20 @@ def _raw(raw: RawFolder) -> Iterator[Finding]:
     except DamagedFile as error:
         yield Finding(raw.folder / CHECKSUMS, str(error), True)
         return
-    remedy = (
-        "`pse run CASE --force` simulates it again".replace("CASE", raw.folder.name)
-        if raw.marker() is not None
-        else "restore it from a copy, or take it as it is with --accept"
-    )
+    simulated = raw.marker() is not None
     if not listed:
-        yield Finding(
-            raw.folder, f"has no {CHECKSUMS}: --accept lists its files as they are now", False
-        )
+        what = remedy(raw.folder) if simulated else "--accept lists its files as they are now"
+        yield Finding(raw.folder, f"has no {CHECKSUMS}: {what}", simulated)
     for name, facts in listed.items():
         path = raw.folder / name
         if not unchanged(path, facts, thorough=True):
             what = "differs from what was written" if path.is_file() else "is gone"
-            yield Finding(path, f"{what}: {remedy}", True)
+            yield Finding(path, f"{what}: {remedy(raw.folder)}", True)
     for path in files_below(raw.folder):
         name = path.relative_to(raw.folder).as_posix()
-        if listed and name not in (*listed, CHECKSUMS, SIMULATED):
-            yield Finding(path, "was added since", False)
+        if listed and is_raw_table(name) and name not in listed:
+            what = f": {remedy(raw.folder)}" if simulated else ""
+            yield Finding(path, f"was added since{what}", simulated)
 
 
 def _stage(case: Case, stage: str, entry: Entry) -> Iterator[Finding]:

@@ -15,8 +15,9 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.linalg import solve_toeplitz
 
+from pse_analysis.checksums import read_checksums
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.files import check, read_checksums
+from pse_analysis.files import check
 from pse_analysis.telemetry.parquet import read_arrow, to_pandas
 
 FloatArray = npt.NDArray[np.float64]

@@ -107,7 +107,7 @@ def merge_files(
 def _metadata(provenance: Mapping[str, Any] | None) -> dict[bytes, bytes] | None:
     if provenance is None:
         return None
-    return {PROVENANCE: json.dumps(provenance, sort_keys=True, ensure_ascii=False).encode()}
+    return {PROVENANCE: json.dumps(provenance, sort_keys=True).encode()}
 
 
 def read_provenance(path: str | Path) -> Mapping[str, Any]:

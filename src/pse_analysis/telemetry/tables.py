@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from pse_analysis import files
+from pse_analysis import checksums, files, leftovers
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
@@ -87,20 +87,24 @@ def write_raw(folder: str | Path, raw: RawCase) -> None:
     Raises
     ------
     TableError
-        If the folder already holds telemetry or any other of the files, or a table breaks its
-        schema.
+        If the folder already holds telemetry or other contents in any of the files, or a table
+        breaks its schema.
     """
-    folder = Path(folder).resolve()
+    folder = files.real(folder)
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise TableError(f"{folder} is not a folder: choose another name, or move it away first")
     if (folder / "telemetry").exists():
         raise TableError(
             f"{folder} already holds telemetry, which is never overwritten: choose another "
             "folder, or remove that one first"
         )
-    part = folder.with_name(f".{folder.name}.tmp-{os.getpid()}")
-    _sweep(folder)
+    for orphan in leftovers.orphans(folder):
+        leftovers.remove_own(orphan, checksums.is_own)
+    part = leftovers.temporary(folder)
+    part.mkdir(parents=True)
     try:
         write_files(part, raw)
-        files.write_checksums(part)
+        checksums.write_checksums(part)
         files.flush_folder(part)
         if folder.exists():
             _move(part, folder)
@@ -108,44 +112,28 @@ def write_raw(folder: str | Path, raw: RawCase) -> None:
             part.replace(folder)
         files.flush(folder.parent)
     finally:
-        files.remove_own(part, _is_own)
+        leftovers.remove_own(part, checksums.is_own)
 
 
 def _move(part: Path, folder: Path) -> None:
     """Bring written files into a folder that is there.
 
-    Telemetry comes last: without it nothing reads the folder.
+    Telemetry comes last: without it nothing reads the folder. A file of the same content is what
+    a writer left that was interrupted here.
     """
     names = [path.relative_to(part) for path in files.files_below(part)]
-    taken = [name for name in names if os.path.lexists(folder / name)]
-    if taken:
-        raise TableError(
-            f"{folder / taken[0]} is there already and is not overwritten: choose another folder, "
-            "or remove that file first"
-        )
+    for name in names:
+        there = folder / name
+        if os.path.lexists(there) and not files.unchanged(there, files.describe(part / name)):
+            raise TableError(
+                f"{there} is there already and is not overwritten: choose another folder, or "
+                "remove that file first"
+            )
     for name in names:
         if name.parts[0] != "telemetry":
             (folder / name).parent.mkdir(exist_ok=True)
             (part / name).replace(folder / name)
     (part / "telemetry").replace(folder / "telemetry")
-
-
-_OWN = re.compile(
-    r"telemetry/source=[^/]+/date=[^/]+/part-0\.parquet|grid/[a-z]+\.parquet|[a-z_]+\.parquet"
-    r"|checksums\.json|\.checksums\.json\.tmp-\d+"
-)
-
-
-def _is_own(name: str) -> bool:
-    return _OWN.fullmatch(name) is not None
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what writers of the same folder left when they were killed."""
-    if folder.parent.is_dir():
-        for path in list(folder.parent.iterdir()):
-            if path.name.startswith(f".{folder.name}.tmp-") and files.is_orphan(path):
-                files.remove_own(path, _is_own)
 
 
 def accept(folder: str | Path) -> None:
@@ -156,11 +144,18 @@ def accept(folder: str | Path) -> None:
     Raises
     ------
     TableError
-        If a table is missing, damaged, or breaks its schema.
+        If a table is missing, damaged, or breaks its schema; or if a simulation made the folder,
+        which would go on to stand for what the case file says.
     """
     folder = Path(folder)
+    if (folder / checksums.SIMULATED).exists():
+        raise TableError(
+            f"{folder} was made by a simulation, whose tables must be as it wrote them: "
+            f"{checksums.remedy(folder)}; to keep your change, remove "
+            f"{folder / checksums.SIMULATED} and the case file's grid and [simulate], then accept"
+        )
     _read_raw(folder, {})
-    files.write_checksums(folder)
+    checksums.write_checksums(folder)
 
 
 def write_files(folder: Path, raw: RawCase) -> None:
@@ -211,6 +206,9 @@ def _write_partitions(folder: Path, telemetry: pd.DataFrame, channels: pd.DataFr
         write_checked(path, part, "telemetry")
 
 
+_PARTITION = re.compile(r"source=([^/]*)/date=([^/]*)/[^/]*\.parquet", re.DOTALL)
+
+
 def read_telemetry(
     folder: str | Path,
     sources: Collection[str] | None = None,
@@ -236,7 +234,7 @@ def read_telemetry(
         If there is no such data, or a file does not fit; the message names it.
     """
     folder = Path(folder)
-    return _read_telemetry(folder, files.read_checksums(folder), sources, dates)
+    return _read_telemetry(folder, checksums.read_checksums(folder), sources, dates)
 
 
 def _read_telemetry(
@@ -251,12 +249,13 @@ def _read_telemetry(
             f"telemetry: no folder {root}; write it with pse_analysis.telemetry.write_raw, or run "
             "the case's simulation"
         )
-    files.refuse_links(folder, ["telemetry"])
+    checksums.refuse_links(folder)
     paths = [
         path
-        for path in sorted(root.glob("source=*/date=*/*.parquet"))
-        if (sources is None or path.parts[-3].removeprefix("source=") in sources)
-        and (dates is None or path.parts[-2].removeprefix("date=") in dates)
+        for path in files.files_below(root)
+        if (place := _PARTITION.fullmatch(path.relative_to(root).as_posix()))
+        and (sources is None or place[1] in sources)
+        and (dates is None or place[2] in dates)
     ]
     if not paths:
         asked = f" for sources {sources or 'all'} and dates {dates or 'all'}"
@@ -291,7 +290,7 @@ def read_raw(folder: str | Path) -> RawCase:
             "machine.parquet in it: write it with pse_analysis.telemetry.write_raw, or run the "
             "case's simulation"
         )
-    return _read_raw(folder, files.read_checksums(folder))
+    return _read_raw(folder, checksums.read_checksums(folder))
 
 
 def _read_raw(folder: Path, listed: Mapping[str, files.Facts]) -> RawCase:
@@ -319,7 +318,7 @@ def read_raw_table(folder: str | Path, table: str) -> pd.DataFrame:
         If it is missing, damaged, or breaks its schema.
     """
     folder = Path(folder)
-    listed = files.read_checksums(folder)
+    listed = checksums.read_checksums(folder)
     return read_table(_checked(folder / f"{table}.parquet", folder, listed), table)
 
 
@@ -332,7 +331,7 @@ def read_model(folder: str | Path) -> Model:
         If one of its files is missing or not whole.
     """
     folder = Path(folder)
-    return _read_model(folder, files.read_checksums(folder))
+    return _read_model(folder, checksums.read_checksums(folder))
 
 
 def _read_model(folder: Path, listed: Mapping[str, files.Facts]) -> Model:
@@ -358,5 +357,5 @@ def _checked(path: Path, folder: Path, listed: Mapping[str, files.Facts]) -> Pat
     """The path of a raw file, once it is seen to be as it was written."""
     facts = listed.get(path.relative_to(folder).as_posix())
     if facts is not None and path.is_file():
-        files.check(path, facts, files.accept(folder))
+        files.check(path, facts, checksums.remedy(folder))
     return path
