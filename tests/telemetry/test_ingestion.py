@@ -266,40 +266,6 @@ def test_values_beyond_all_numbers_are_kept_for_validation():
     assert raw.telemetry.value.abs().max() == pytest.approx(1e305)
 
 
-# The bus is rated 12.66 kV.
-@pytest.mark.parametrize(
-    ("unit", "value", "remedy"),
-    [
-        ("pu", 12.66, "look like kV: write unit = 'kv'"),
-        ("pu", 12500.0, "look like V: divide values, sigma and limits by 1000"),
-        ("pu", 98.0, "look like per cent: divide values, sigma and limits by 100"),
-        ("pu", 7.31, "look like kV from phase to ground: multiply values, sigma and limits by √3"),
-        ("kv", 1.02, "look like p.u.: write unit = 'pu'"),
-        ("kv", 12660.0, "look like V: divide values"),
-    ],
-)
-def test_voltages_of_another_unit_are_refused_with_the_unit_to_write(unit, value, remedy):
-    about = channels().assign(unit=[unit, "kW", "A"], lower=np.nan, upper=np.nan)
-    own = frame(value=[value, value, 60.0, 80.0, 120.0, 125.0])
-    with pytest.raises(TableError) as refused:
-        ingest(own, about, feeder())
-    assert remedy in str(refused.value)
-    assert "rated 12.66 kV" in str(refused.value)
-    ingest(own, about, feeder(), units="accept")
-
-
-def test_one_broken_voltage_meter_is_named_and_stops_nothing(caplog):
-    ingest(frame(value=[400.0, 410.0, 60.0, 80.0, 120.0, 125.0]), channels(), feeder())
-    assert "'U6' has a median of 405 kv = 31.99 p.u. at bus/6" in caplog.text
-
-
-def test_flows_that_dwarf_the_grid_are_named(caplog):
-    about = channels().assign(unit=["kV", "MW", "kA"], lower=np.nan, upper=np.nan)
-    ingest(frame(value=[12.66, 12.5, 600.0, 800.0, 120.0, 125.0]), about, feeder())
-    assert "if these values are in kw, write unit = 'kw'" in caplog.text
-    assert "if these values are in a, write unit = 'a'" in caplog.text
-
-
 def test_a_choice_that_does_not_exist_is_refused():
     with pytest.raises(TableError, match="shunts must be 'refuse' or 'accept', received 'ignore'"):
         ingest(frame(), channels(), feeder(), shunts="ignore")
