@@ -193,7 +193,6 @@ def main(count: int, number: int, names: Sequence[str] = ()) -> int:
             path.write_text(failure.text(), encoding="utf-8", errors="backslashreplace")
             stored.append(path)
             print(f"  {failure.outcome}: {place(failure.error)}; see {path}", file=sys.stderr)
-    odd_parquet.remove_folder()
     print(f"{whole.total()} mutated inputs with seed {number}: {_line(whole)}")
     return 0 if not stored and set(whole) <= {OK, REFUSED} else 1
 

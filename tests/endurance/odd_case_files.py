@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import copy
+import shutil
 import tempfile
 import tomllib
 from collections.abc import Callable
@@ -88,7 +90,10 @@ def _line(text: bytes, at: int, piece: bytes) -> bytes:
 
 @cache
 def _folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="pse_cases_"))
+    """A folder of this process."""
+    folder = Path(tempfile.mkdtemp(prefix="pse_cases_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _load(text: bytes) -> Parameters:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -173,6 +174,7 @@ def _apply(table: Arrow, changes: list[Change]) -> Arrow:
 def _folder() -> Path:
     """A folder of this process, with a raw case in it."""
     folder = Path(tempfile.mkdtemp(prefix="pse_parquet_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     write_raw(folder / "raw", tiny_case.plain_run().raw)
     # Written by another program: nothing lists its checksums.
     (folder / "raw" / "checksums.json").unlink()
@@ -223,10 +225,3 @@ def _machine() -> Arrow:
         {"name": ["1"], "s_mva": 200.0, "u_kv": 13.8, "f_hz": 50.0, "t_j_s": 6.4, "k_d_pu": 0.03}
     )
     return pa.Table.from_pandas(frame, preserve_index=False)
-
-
-def remove_folder() -> None:
-    """Remove what this process wrote."""
-    if _folder.cache_info().currsize:
-        shutil.rmtree(_folder())
-        _folder.cache_clear()
