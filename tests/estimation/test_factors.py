@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from qu_bench import still
 
 from pse_analysis.estimation.conditioning import Moments, Prior
-from pse_analysis.estimation.factors import Columns, Root, cholesky, squared_inverse
+from pse_analysis.estimation.factors import (
+    Columns,
+    Root,
+    cholesky,
+    factor,
+    solve,
+    squared_inverse,
+)
+from pse_analysis.estimation.replay import EPOCH
 from pse_analysis.estimation.robust import Suspicion
+from pse_analysis.measurement import VA, VM
 
 SEED = 3
 
@@ -84,3 +96,21 @@ def test_what_is_certain_does_not_stop_a_factorisation() -> None:
     S[2, 2] = -1e-3
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         cholesky(S)
+
+
+def test_nothing_is_written_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    """LAPACK complains there of matrices without rows; a layout of voltages alone leads to one."""
+    none = np.zeros((0, 0))
+    assert len(squared_inverse(none)) == len(cholesky(none)) == 0
+    assert len(solve(none, np.zeros(0))) == len(factor(none, np.zeros(0))) == 0
+    b = still("ieee14")
+    few = np.flatnonzero(np.isin(b.layout.quantity, (VM, VA)))
+    layout = dataclasses.replace(b, layout=b.layout.take(few), exact=b.exact[:, few])
+    made = layout.filter(robustness="per_channel")
+    z = layout.exact[0].copy()
+    z[3] += 1.0
+    state = made.begin(b.truth[0], b.start, EPOCH)
+    _, info = made.step(state, layout.snapshot(z))
+    assert info.inflation[3] > 0
+    out, err = capfd.readouterr()
+    assert out == err == ""

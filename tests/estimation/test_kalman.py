@@ -211,9 +211,10 @@ def test_filter_of_a_case_file_forecasts_and_estimates_its_noise(
     history = Record(np.zeros(0, dtype="datetime64[us]"), no, no, no, off, off, no)
     made = build(method, b.network, b.layout, study, history)
     state, _ = made.init(b.snapshot(0))
-    assert len(state.x) == 2 * b.network.n_bus * (2 if process == "local_trend" else 1)
+    assert len(state.inner.x) == 2 * b.network.n_bus * (2 if process == "local_trend" else 1)
     for k in range(1, 12):
         state, info = made.step(state, b.snapshot(k))
         assert info.status is Status.OK
-    assert (state.noise.level != made.init(b.snapshot(0))[0].noise.level).any()
+    first = made.init(b.snapshot(0))[0].inner
+    assert (state.inner.noise.level != first.noise.level).any()
     assert np.abs(made.read(state).x - b.truth).max() < 5e-3

@@ -53,7 +53,7 @@ def test_scalar_noise_is_added_to_every_voltage() -> None:
     state, _ = estimator.init(b.snapshot(b.exact[0]))
     nothing = np.zeros(len(b.layout), dtype=bool)
     after, _ = estimator.step(state, b.snapshot(b.exact[0], nothing))
-    np.testing.assert_allclose(np.diagonal(after.P - state.P), 1e-3)
+    np.testing.assert_allclose(np.diagonal(after.inner.P - state.inner.P), 1e-3)
 
 
 def test_load_noise_moves_what_the_loads_move_and_not_the_reference() -> None:
@@ -62,7 +62,7 @@ def test_load_noise_moves_what_the_loads_move_and_not_the_reference() -> None:
     state, _ = estimator.init(b.snapshot(b.exact[0]))
     nothing = np.zeros(len(b.layout), dtype=bool)
     after, _ = estimator.step(state, b.snapshot(b.exact[0], nothing))
-    added = np.diagonal(after.P - state.P)
+    added = np.diagonal(after.inner.P - state.inner.P)
     slack, n = b.network.slack, b.network.n_bus
     assert added[slack] == pytest.approx(0.0, abs=1e-15)
     assert added[n + slack] == pytest.approx(1e-6)

@@ -18,6 +18,7 @@ from pse_analysis.estimation import (
     matching,
     process,
     refusal,
+    restart,
     screening,
 )
 from pse_analysis.estimation.composition import Composition
@@ -26,6 +27,7 @@ from pse_analysis.estimation.estimator import Estimator, Info
 from pse_analysis.estimation.kalman import kalman_filter
 from pse_analysis.estimation.noise import of_grid
 from pse_analysis.estimation.records import Record, record
+from pse_analysis.estimation.restart import RestartParams
 from pse_analysis.estimation.tracking import tracking_wls
 from pse_analysis.estimation.wls import state_columns
 from pse_analysis.grid.network import Network
@@ -83,6 +85,8 @@ class Method:
     screening : {"none", "literal", "absolute", "scaled", "innovation"}
         How gross errors are met: by an adaptive threshold before any filter, or, in a ``kalman``
         filter, by its own innovation.
+    restart : RestartParams
+        When a filter starts again.
     variant : str
         The aligned variant it reads.
     """
@@ -97,6 +101,7 @@ class Method:
     reading: Literal["interval", "instant"] = "interval"
     linearisation: Linearisation = "derivative"
     screening: Literal["none", "literal", "absolute", "scaled", "innovation"] = "none"
+    restart: RestartParams = field(default_factory=RestartParams)
     variant: str = "last"
 
     def __post_init__(self) -> None:
@@ -168,6 +173,8 @@ def build(
         If the method is one of a machine.
     """
     estimator = _build_plain(method, network, layout, study, history)
+    if method.filter != "wls":
+        estimator = restart.guarded(estimator, layout, method.restart)
     if method.screening == "none" or method.screening == "innovation":
         return estimator
     return screening.screened(

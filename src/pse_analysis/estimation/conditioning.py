@@ -1,4 +1,9 @@
-"""Conditioning of a normal state on measurements: factorisations and symmetric products only."""
+"""Conditioning of a normal state on measurements: factorisations and symmetric products only.
+
+P - K S Kᵀ is exact to rounding of P. What measurements leave of a variance must therefore be larger
+than that, or the difference is no covariance any more: then a root of P takes them in instead
+(`pse_analysis.estimation.factors.absorbed`), which loses nothing and takes longer.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas
 
-from pse_analysis.estimation.factors import Root, cholesky, factor, solve
+from pse_analysis.estimation.factors import Root, absorbed, cholesky, factor, solve, symmetric
 from pse_analysis.estimation.robust import Suspicion
 
 FloatArray = npt.NDArray[np.float64]
@@ -21,6 +26,13 @@ Rows = slice | IntArray
 
 FEW = 4
 """Up to one in so many channels, inflated noise is added to S by a correction of its factor."""
+
+LEFT = 1e-5
+"""Least share of a variance that may be left for its difference to be believed."""
+EXACT = 1e-10
+"""Least share of S_ii that a measurement's own noise may be for the same."""
+ROUNDING = 1e-14
+"""Least noise of a measurement, as a share of the variance that the forecast expects of it."""
 
 Verdict = Callable[[Suspicion], FloatArray]
 """Inflation φ (m,) of the noise that an innovation calls for."""
@@ -140,6 +152,9 @@ class Moments(NamedTuple):
         What the observation remembers for the next step.
     entry : (k,) ndarray of int, optional
         Which entry of s each of the first k measurements reads.
+    halves : callable, optional
+        (prior) -> D (m, n) and the rest of ``own`` (m, m): C = L Dᵀ with the first n columns of
+        the root of P, own = D Dᵀ + rest. They are taken from the moments where this is not given.
     """
 
     mean: FloatArray
@@ -147,18 +162,26 @@ class Moments(NamedTuple):
     cross: FloatArray
     tuned: float = 0.0
     entry: IntArray | None = None
+    halves: Callable[[Prior], tuple[FloatArray, FloatArray]] | None = None
 
     def condition(
-        self, prior: Prior, innovation: FloatArray, noise: FloatArray, verdict: Verdict | None
+        self,
+        prior: Prior,
+        innovation: FloatArray,
+        noise: FloatArray,
+        verdict: Verdict | None,
+        solved: Solved | None = None,
     ) -> Posterior:
         """Condition on an innovation, with the noise that a verdict leaves; see `Predicted`.
+
+        What is ``solved`` already need not be given, and is not solved again.
 
         Notes
         -----
         With S = L Lᵀ and X = C L⁻ᵀ: K η = X (L⁻¹η) and P - K S Kᵀ = P - X Xᵀ, a symmetric product.
         Noise added to few rows F makes that P - X Xᵀ + Z Zᵀ, Z = X Y, see `_relaxation`.
         """
-        solved = self.solved(innovation, noise)
+        solved = solved or self.solved(innovation, noise)
         variance, white = solved.variance, solved.white
         inflation, relaxed = np.zeros(len(noise)), None
         if verdict is not None:
@@ -174,8 +197,34 @@ class Moments(NamedTuple):
             through = white @ relaxed
             white = white - relaxed @ through
             nis -= float(through @ through)
-        s, P = prior.s + solved.X @ white, solved.reduced(prior.P, relaxed)
-        return Posterior(s, P, variance, inflation, nis)
+        believed = noise + inflation * noise
+        if (believed >= EXACT * variance).all():
+            P = solved.reduced(prior.P, relaxed)
+            if (np.diagonal(P) >= LEFT * np.diagonal(prior.P)).all():
+                return Posterior(prior.s + solved.X @ white, P, variance, inflation, nis)
+        return self._absorbed(prior, innovation, believed, variance, inflation)
+
+    def _absorbed(
+        self,
+        prior: Prior,
+        innovation: FloatArray,
+        noise: FloatArray,
+        variance: FloatArray,
+        inflation: FloatArray,
+    ) -> Posterior:
+        """The same by a root of P, for measurements that leave next to nothing of a variance."""
+        odd, rest = (self.halves or self._halves)(prior)
+        rest.flat[:: len(rest) + 1] += np.maximum(noise, ROUNDING * np.diagonal(self.own))
+        moved, root, nis = absorbed(prior.chol_P, odd, cholesky(rest), innovation)
+        P = symmetric(blas.dsyrk(1.0, root, lower=1))
+        return Posterior(prior.s + moved, P, variance, inflation, nis)
+
+    def _halves(self, prior: Prior) -> tuple[FloatArray, FloatArray]:
+        """D and the rest of ``own``, which rounding must not make indefinite."""
+        odd = solve(prior.chol_P, self.cross).T
+        value, vector = np.linalg.eigh(symmetric(self.own) - odd @ odd.T)
+        half = vector * np.sqrt(np.maximum(value, 0.0))
+        return odd, half @ half.T
 
     def solved(self, innovation: FloatArray, noise: FloatArray) -> Solved:
         """S of an innovation with the diagonal of R, factorised.
@@ -185,7 +234,9 @@ class Moments(NamedTuple):
         numpy.linalg.LinAlgError
             If S is not positive definite.
         """
-        variance = np.diagonal(self.own) + noise
+        own = np.diagonal(self.own)
+        # Where a covariance and a noise far below it meet, rounding decides: it counts as noise.
+        variance = own + np.maximum(noise, ROUNDING * own)
         chol_S = factor(self.own, variance)
         return Solved(chol_S, solve(chol_S, innovation), variance, self.cross)
 

@@ -13,7 +13,7 @@ import pandas as pd
 from scipy import stats
 
 from pse_analysis.errors import NotConverged, Unobservable
-from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Snapshot
+from pse_analysis.estimation.estimator import FAILURES, Estimate, Estimator, Info, Snapshot
 from pse_analysis.machine import STATES, Machine
 from pse_analysis.measurement import Model, SensorLayout, wrap
 from pse_analysis.vocabulary import Status
@@ -123,20 +123,8 @@ def run(
     nothing = np.full(len(states), np.nan)
     for k, snapshot in enumerate(snapshots):
         begun = time.perf_counter()
-        try:
-            # A state that leaves the range of numbers is told by its status.
-            with np.errstate(all="ignore"):
-                state, info = (
-                    estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
-                )
-        except (NotConverged, Unobservable, np.linalg.LinAlgError) as error:
-            # One snapshot that cannot be computed with stops no run: the next one starts anew.
-            status = (
-                Status.UNOBSERVABLE if isinstance(error, Unobservable) else Status.NOT_CONVERGED
-            )
-            state, info = None, Info.nothing(len(layout), status, str(error))
+        state, info, estimate = _outlived(estimator, state, snapshot, len(layout))
         seconds = time.perf_counter() - begun
-        estimate = None if state is None else estimator.read(state)
         if estimate is not None and not (
             np.isfinite(estimate.x).all() and np.isfinite(np.diagonal(estimate.covariance)).all()
         ):
@@ -156,6 +144,26 @@ def run(
         reference = None if truth is None else truth[k]
         trace.nees.append(_nees(estimate, reference, states.folded))
     return _tables(estimator.name, trial, trace, states, layout)
+
+
+def _outlived(
+    estimator: Estimator, state: Any, snapshot: Snapshot, m: int
+) -> tuple[Any, Info, Estimate | None]:
+    """A step and its estimate; none of both where the numbers of the snapshot do not allow it."""
+    try:
+        # A state that leaves the range of numbers is told by its status.
+        with np.errstate(all="ignore"):
+            state, info = (
+                estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
+            )
+            return state, info, None if state is None else estimator.read(state)
+    except FAILURES as error:
+        if isinstance(error, Unobservable | NotConverged):
+            unobservable = isinstance(error, Unobservable)
+            status = Status.UNOBSERVABLE if unobservable else Status.NOT_CONVERGED
+            return None, Info.nothing(m, status, str(error)), None
+        why = f"{type(error).__name__}: {error}: it restarts next instant"
+        return None, Info.nothing(m, Status.DIVERGED, why), None
 
 
 def _nees(estimate: Estimate | None, truth: FloatArray | None, folded: BoolArray) -> float:

@@ -14,10 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.errors import PseError
 from pse_analysis.vocabulary import Reason, Status
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+
+FAILURES = (ArithmeticError, ValueError, RuntimeError, PseError)
+"""What the numbers of a snapshot may raise; `numpy.linalg.LinAlgError` is a ValueError."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +135,13 @@ Voltages = Estimate
 
 
 class Estimator(NamedTuple):
-    """A method: three functions over an opaque state."""
+    """A method: three functions over an opaque state.
+
+    ``widened``, where it is given, makes a state far more uncertain.
+    """
 
     name: str
     init: Callable[[Snapshot], tuple[Any, Info]]
     step: Callable[[Any, Snapshot], tuple[Any, Info]]
     read: Callable[[Any], Estimate | None]
+    widened: Callable[[Any], Any] | None = None

@@ -1,4 +1,8 @@
-"""Triangular roots of covariances, and what is made of them without ever inverting one."""
+"""Triangular roots of covariances, and what is made of them without ever inverting one.
+
+LAPACK writes to the terminal what it cannot work with, so that nothing empty and nothing that is
+not finite is given to it.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,8 @@ IntArray = npt.NDArray[np.int64]
 
 SMALL = 128
 """Rows up to which LAPACK inverts a triangle faster than two halves of it are."""
+BLOCK = 16
+"""Columns that LAPACK reflects at once."""
 
 
 class Columns:
@@ -93,6 +99,8 @@ class Root:
 def squared_inverse(chol: FloatArray) -> FloatArray:
     """Sums of squares of the columns of L⁻¹. (m,)"""
     m = len(chol)
+    if not m:
+        return np.zeros(0)
     if m <= SMALL:
         return _squares(_triangle(chol))
     h = m // 2
@@ -138,6 +146,8 @@ def cholesky(matrix: FloatArray) -> FloatArray:
     numpy.linalg.LinAlgError
         If not even that helps.
     """
+    if not len(matrix):
+        return matrix.copy()
     # Its transpose is itself, in the order that LAPACK reads.
     found, failed = lapack.dpotrf(matrix.T, lower=1, clean=1)
     for power in (-14, -12, -10, -8, -6):
@@ -160,6 +170,8 @@ def factor(own: FloatArray, diagonal: FloatArray) -> FloatArray:
     numpy.linalg.LinAlgError
         If it is not positive definite.
     """
+    if not len(own):
+        return own
     S = own.copy(order="F")
     S.reshape(-1, order="A")[:: len(S) + 1] = diagonal
     found, failed = lapack.dpotrf(S, lower=1, clean=0, overwrite_a=1)
@@ -168,8 +180,62 @@ def factor(own: FloatArray, diagonal: FloatArray) -> FloatArray:
     return np.asarray(found)
 
 
+def absorbed(
+    chol_P: FloatArray, odd: FloatArray, chol_V: FloatArray, innovation: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Correction and root of a covariance that takes measurements in without a difference.
+
+    Parameters
+    ----------
+    chol_P : (N, N) ndarray
+        L of P = L Lᵀ, lower triangular.
+    odd : (m, n) ndarray
+        D: the covariance of the state and the measurements is L Dᵀ with the first n columns of L.
+    chol_V : (m, m) ndarray
+        Lower triangular V of V Vᵀ = S - D Dᵀ.
+    innovation : (m,) ndarray
+        η.
+
+    Returns
+    -------
+    correction : (N,) ndarray
+    chol_P : (N, N) ndarray
+        Root of the posterior covariance, lower triangular.
+    nis : float
+        ηᵀS⁻¹η.
+
+    Notes
+    -----
+    See `pse_analysis.estimation.square_root`.
+    """
+    m, n = odd.shape
+    right = np.empty((m, n + 1), order="F")
+    right[:, :-1], right[:, -1] = odd[:, ::-1], innovation
+    start = np.zeros((n + 1, n + 1), order="F")
+    np.fill_diagonal(start[:-1, :-1], 1.0)
+    found = reflect(start, solve(chol_V, right), 0)
+    # Turned round again, the factor is G⁻¹.
+    G_inverse = np.asfortranarray(found[-2::-1, -2::-1])
+    root = chol_P.copy(order="F")
+    root[:, :n] = blas.dtrsm(1.0, G_inverse, root[:, :n], side=1, lower=1)
+    return root[:, :n] @ found[-2::-1, -1], root, float(found[-1, -1]) ** 2
+
+
+def reflect(upper: FloatArray, below: FloatArray, shape: int) -> FloatArray:
+    """Triangular factor of an upper triangular matrix stacked on another one.
+
+    ``shape`` is the number of last rows of the latter that are upper triangular too.
+    """
+    if not len(below):
+        return upper
+    found, *_ = lapack.dtpqrt(shape, min(BLOCK, len(upper)), upper, below)
+    return np.asarray(np.triu(found))
+
+
 def solve(chol: FloatArray, right: FloatArray) -> FloatArray:
     """L⁻¹ times one or many vectors, for a lower triangular L."""
+    if not len(chol):
+        return right
     found, _ = lapack.dtrtrs(chol, right, lower=1)
     return np.asarray(found)
 

@@ -18,6 +18,7 @@ from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltage
 from pse_analysis.estimation.holt import Process
 from pse_analysis.estimation.noise import Learnt, Noise
 from pse_analysis.estimation.recovery import Recovery
+from pse_analysis.estimation.restart import WIDER
 from pse_analysis.estimation.robust import Judge, Protection
 from pse_analysis.estimation.square_root import carried
 from pse_analysis.estimation.start import begin
@@ -245,4 +246,8 @@ def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianF
         covariance[inside] = state.P[: len(columns), : len(columns)]
         return Voltages(state.x, covariance)
 
-    return Estimator(name, init, made.step, read)
+    def widened(state: GaussianState) -> GaussianState:
+        root = None if state.chol_P is None else WIDER * state.chol_P
+        return replace(state, P=WIDER**2 * state.P, chol_P=root)
+
+    return Estimator(name, init, made.step, read, widened)

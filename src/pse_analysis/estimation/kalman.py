@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.estimation import holt, intervals, matching
-from pse_analysis.estimation.conditioning import Solved
+from pse_analysis.estimation.conditioning import Prior, Solved
 from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.factors import cleaned
 from pse_analysis.estimation.lagged import Belief, Lagged, Reach, Rows
 from pse_analysis.estimation.matching import Matched, Matching
 from pse_analysis.estimation.process import ProcessNoise, to_polar, to_rectangular
 from pse_analysis.estimation.refusal import Refuse
+from pse_analysis.estimation.restart import WIDER, gross_errors
 from pse_analysis.estimation.row_moments import Expansion, RowMoments
 from pse_analysis.estimation.start import begin
 from pse_analysis.estimation.wls import WeightedLeastSquares
@@ -35,7 +36,7 @@ ComplexArray = npt.NDArray[np.complex128]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-MAX_PASSES = 3
+MAX_PASSES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,14 +151,14 @@ class KalmanFilter:
                     sigma_innovation=told[1],
                     reasons=_refusals(refused),
                 )
-            x, found, solved, passes = self._corrected(prior.x, reading, *first)
-            P = solved.reduced(prior.P)
-        except np.linalg.LinAlgError:
+            found, solved, passes = self._corrected(prior.x, reading, *first)
+            given_prior = Prior(prior.x, prior.P, prior.x, np.arange(len(prior.x)))
+            after = found.moments.condition(
+                given_prior, found.eta, found.linear.spread**2, None, solved
+            )
+        except np.linalg.LinAlgError as error:
             return None, Info.nothing(
-                m,
-                Status.DIVERGED,
-                "the innovation's covariance is not positive definite: the filter starts "
-                "again from least squares",
+                m, Status.DIVERGED, f"{error}: the filter starts again from least squares"
             )
         told[:, used] = found.eta, solved.sigma
         learnt = state.noise
@@ -165,10 +166,10 @@ class KalmanFilter:
             moving = 1.0 if found.reach is None else found.reach.moving
             response = matching.responses(shapes, found.plane, moving, solved.chol_S)
             learnt = self._noise.learn(learnt, response, solved.white)
-        return KalmanState(x, P, prior.memory, learnt), Info(
+        return KalmanState(after.s, after.P, prior.memory, learnt), Info(
             Status.OK,
             passes,
-            solved.nis,
+            after.nis,
             len(solved.white),
             used,
             told[0],
@@ -186,21 +187,21 @@ class KalmanFilter:
 
     def _refuses(self, found: Expansion, solved: Solved) -> BoolArray:
         """Which rows contradict the others and the forecast. (r,)"""
-        if self.refuse is None:
-            return np.zeros(len(found.eta), dtype=bool)
+        gross = gross_errors(found.eta, solved.variance, solved.nis)
+        if self.refuse is None or gross.any():
+            return gross
         return self.refuse(found.eta, cleaned(solved.chol_S), found.linear.spread)
 
     def _corrected(
         self, x: FloatArray, reading: RowMoments, found: Expansion, solved: Solved
-    ) -> tuple[FloatArray, Expansion, Solved, int]:
-        """A forecast corrected by rows, which are renewed where it moves far."""
+    ) -> tuple[Expansion, Solved, int]:
+        """The rows about what they correct a forecast to, where it moves far."""
         for passes in range(1, MAX_PASSES + 1):
-            after = x + solved.correction()
-            instants = self.lagged.revised(reading.instants, after)
+            instants = self.lagged.revised(reading.instants, x + solved.correction())
             if passes == MAX_PASSES or reading.settled(found, instants):
                 break
             found, solved = self._expanded(reading, instants)
-        return after, found, solved, passes
+        return found, solved, passes
 
     def _usable(self, snapshot: Snapshot) -> tuple[BoolArray, FloatArray]:
         """Rows that are used, and their σ."""
@@ -319,7 +320,10 @@ def kalman_filter(
         covariance = turn @ state.P[: 2 * n, : 2 * n] @ turn.T
         return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
 
-    return Estimator(name, init, made.step, read)
+    def widened(state: KalmanState) -> KalmanState:
+        return replace(state, P=WIDER**2 * state.P)
+
+    return Estimator(name, init, made.step, read, widened)
 
 
 def _refusals(refused: BoolArray) -> npt.NDArray[np.int32]:

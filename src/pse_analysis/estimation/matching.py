@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.process import Sensitivity
+from pse_analysis.estimation.process import Sensitivity, at_least, in_frame, turned_rows
 from pse_analysis.grid.network import Network
 
 FloatArray = npt.NDArray[np.float64]
@@ -177,10 +177,16 @@ def of_loads(
             "q_load_mvar in the buses table, or meter injections before the study"
         )
 
+    least = at_least(size)
+
     def halves(voltage: ComplexArray) -> tuple[FloatArray, ...]:
-        by_input, by_voltage = moves(voltage)
-        alone = by_input * np.abs(size)
-        return alone, (by_input @ size)[:, None], by_voltage
+        at_source, frame = in_frame(voltage, network.slack)
+        by_input, by_voltage = moves(at_source)
+        return (
+            turned_rows(by_input * least, frame),
+            turned_rows((by_input @ size)[:, None], frame),
+            turned_rows(by_voltage, frame),
+        )
 
     return Matching(halves, START, window)
 

@@ -11,10 +11,13 @@ from scipy import linalg
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.holt import Process
-from pse_analysis.estimation.process import ProcessNoise, to_polar
+from pse_analysis.estimation.process import ProcessNoise, in_frame, to_polar
 from pse_analysis.grid.network import Network
 
 FloatArray = npt.NDArray[np.float64]
+
+ROUNDING = 1e-14
+"""Share of the variances that make up another one, below which it is zero."""
 
 VoltageNoise = Callable[[FloatArray, np.datetime64], FloatArray]
 """Covariance (n, n) of the step to an instant, at a forecast [θ; |V|] (2N,)."""
@@ -71,9 +74,15 @@ def of_grid(network: Network, noise: ProcessNoise, columns: npt.NDArray[np.int64
     inside = np.ix_(columns, columns)
 
     def polar(x: FloatArray, time: np.datetime64) -> FloatArray:
-        voltage = x[n:] * np.exp(1j * x[:n])
+        # In the frame of the source: angles move alike in all.
+        voltage, _ = in_frame(x[n:] * np.exp(1j * (x[:n] - x[network.slack])), network.slack)
         turn = to_polar(voltage)
-        return np.asarray((turn @ noise(voltage, time) @ turn.T)[inside])
+        Q = noise(voltage, time)
+        found = (turn @ Q @ turn.T)[inside]
+        # What does not move must not move by what rounding makes of it.
+        still = np.diagonal(found) <= ROUNDING * (turn**2 @ np.diagonal(Q))[columns]
+        found[still] = found[:, still] = 0.0
+        return np.asarray(found)
 
     return polar
 
@@ -91,10 +100,11 @@ def known(voltages: VoltageNoise, process: Process) -> Noise:
 
 
 class _Moments(NamedTuple):
-    """Mean and covariance so far, and how many steps they rest on."""
+    """Mean and covariance so far, the covariance before all, and how many steps they rest on."""
 
     mean: FloatArray
     covariance: FloatArray
+    start: FloatArray
     steps: int
 
 
@@ -123,18 +133,28 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
     With d = (1-b)/(1-b^{k+1}): q ← (1-d) q + d (x̂ - F x̂₋₁ - g) and
     Q ← (1-d) Q + d (K ηηᵀ Kᵀ + P - F P₋₁ Fᵀ). Where the latter is not positive definite, P - F P₋₁
     Fᵀ is left out, which is biased but never negative.
+
+    Fading memory holds (1+b)/(1-b) steps, few more than a grid has voltages, and the covariance of
+    so few samples is far too small in some directions. What the filter uses is therefore drawn
+    towards the shape of the start, by the share n/(n + steps in memory) and at the size learnt.
     """
     if not 0.0 < forgetting < 1.0:
         raise ParameterError(f"sage_husa: expected 0 < forgetting < 1, received {forgetting}")
 
     def begin(x: FloatArray, time: np.datetime64) -> _Moments:
         covariance = process.noise(voltages(x, time))
-        return _Moments(np.zeros(len(covariance)), covariance, 0)
+        return _Moments(np.zeros(len(covariance)), covariance, covariance, 0)
 
     def current(
         memory: _Moments, _x: FloatArray, _time: np.datetime64
     ) -> tuple[FloatArray, FloatArray, _Moments]:
-        return memory.mean, memory.covariance, memory
+        n, size = len(memory.start), float(np.trace(memory.start))
+        if memory.steps == 0 or size == 0.0:
+            return memory.mean, memory.covariance, memory
+        share = n / (n + min(memory.steps, (1.0 + forgetting) / (1.0 - forgetting)))
+        scale = float(np.trace(memory.covariance)) / size
+        drawn = (1.0 - share) * memory.covariance + (share * scale) * memory.start
+        return memory.mean, drawn, memory
 
     def learn(memory: _Moments, step: Learnt) -> _Moments:
         count = memory.steps + 1
@@ -143,7 +163,7 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
         safe = np.outer(share * step.correction, step.correction)
         safe += (1.0 - share) * memory.covariance
         unbiased = safe + share * (step.posterior - step.forecast)
-        return _Moments(mean, unbiased if _positive(unbiased) else safe, count)
+        return _Moments(mean, unbiased if _positive(unbiased) else safe, memory.start, count)
 
     return Noise(begin, current, learn, voltages)
 

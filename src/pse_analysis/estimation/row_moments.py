@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from pse_analysis.estimation.conditioning import Moments
+from pse_analysis.estimation.extended import linear_halves
 from pse_analysis.estimation.lagged import Belief, Lagged, Reach, Rows
 from pse_analysis.measurement.rectangular import Frame, Linear, Linearisation
 
@@ -140,7 +141,8 @@ class RowMoments:
             mean[pattern.power] += (across * beyond).real / np.abs(metered)
         plane = self._rows.plane(linear)
         expected = self._lagged.expect(*self._given, self._rows, plane, self._reach)
-        moments = Moments(mean, expected.own.T, expected.cross.T)
+        halves = linear_halves(plane) if self._reach is None else None
+        moments = Moments(mean, expected.own.T, expected.cross.T, halves=halves)
         return Expansion(instants, about, linear, plane, linear.linear - mean, moments, self._reach)
 
     def settled(self, expansion: Expansion, instants: ComplexArray) -> bool:

@@ -20,14 +20,11 @@ import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
 from pse_analysis.estimation.conditioning import Posterior, Prior, Rows, Verdict, block
-from pse_analysis.estimation.factors import Root, factor, solve, symmetric
+from pse_analysis.estimation.factors import Root, absorbed, factor, reflect, solve, symmetric
 from pse_analysis.estimation.robust import Suspicion
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-
-BLOCK = 16
-"""Columns that LAPACK reflects at once."""
 
 
 class Halves(NamedTuple):
@@ -53,15 +50,21 @@ class Halves(NamedTuple):
     bent: FloatArray
     tuned: float = 0.0
 
-    def condition(
-        self, prior: Prior, innovation: FloatArray, noise: FloatArray, verdict: Verdict | None
-    ) -> Posterior:
-        """Condition on an innovation, with the noise that a verdict leaves; see `Predicted`."""
-        m = len(noise)
+    @property
+    def rest(self) -> FloatArray:
+        """B Bᵀ of all rows, its lower triangle. (m, m)"""
+        m = len(self.mean)
         rest = np.zeros((m, m), order="F")
         if len(self.bent):
             inside = block(self.curved, self.curved)
             rest[inside] = blas.dsyrk(1.0, self.bent.T, trans=1, lower=1)
+        return rest
+
+    def condition(
+        self, prior: Prior, innovation: FloatArray, noise: FloatArray, verdict: Verdict | None
+    ) -> Posterior:
+        """Condition on an innovation, with the noise that a verdict leaves; see `Predicted`."""
+        m, rest = len(noise), self.rest
         known = np.diagonal(rest).copy()
         variance = known + noise + np.einsum("ij,ij->i", self.odd, self.odd)
         inflation = np.zeros(m)
@@ -71,20 +74,9 @@ class Halves(NamedTuple):
             white = solve(chol_S, innovation)
             inflation = verdict(Suspicion(innovation, variance, noise, white, Root(chol_S)))
         chol_V = factor(rest, known + (1.0 + inflation) * noise)
-        right = np.empty((m, prior.n + 1), order="F")
-        right[:, :-1], right[:, -1] = self.odd[:, ::-1], innovation
-        start = np.zeros((prior.n + 1, prior.n + 1), order="F")
-        np.fill_diagonal(start[:-1, :-1], 1.0)
-        found = _reflect(start, solve(chol_V, right), 0)
-        # Turned round again, the factor is G⁻¹.
-        G_inverse = np.asfortranarray(found[-2::-1, -2::-1])
-        chol_P = prior.chol_P.copy(order="F")
-        chol_P[:, : prior.n] = blas.dtrsm(
-            1.0, G_inverse, chol_P[:, : prior.n], side=1, lower=1, overwrite_b=1
-        )
-        s = prior.s + chol_P[:, : prior.n] @ found[-2::-1, -1]
+        moved, chol_P, nis = absorbed(prior.chol_P, self.odd, chol_V, innovation)
         P = symmetric(blas.dsyrk(1.0, chol_P, lower=1))
-        return Posterior(s, P, variance, inflation, float(found[-1, -1]) ** 2, chol_P)
+        return Posterior(prior.s + moved, P, variance, inflation, nis, chol_P)
 
 
 def carried(chol_P: FloatArray, noise: FloatArray) -> FloatArray:
@@ -102,15 +94,6 @@ def carried(chol_P: FloatArray, noise: FloatArray) -> FloatArray:
         added, pivot, rank, _ = lapack.dpstrf(noise.T, lower=1)
         turned = np.zeros((len(noise), rank))
         turned[pivot - 1] = np.tril(added)[:, :rank]
-        added = _reflect(np.zeros_like(noise, order="F"), turned.T, 0).T
+        added = reflect(np.zeros_like(noise, order="F"), turned.T, 0).T
     both_triangular = not np.triu(chol_P, 1).any()
-    return _reflect(added.T, chol_P.T, len(chol_P) if both_triangular else 0).T
-
-
-def _reflect(upper: FloatArray, below: FloatArray, shape: int) -> FloatArray:
-    """Triangular factor of an upper triangular matrix stacked on another one.
-
-    ``shape`` is the number of last rows of the latter that are upper triangular too.
-    """
-    found, *_ = lapack.dtpqrt(shape, min(BLOCK, len(upper)), upper, below)
-    return np.asarray(np.triu(found))
+    return reflect(added.T, chol_P.T, len(chol_P) if both_triangular else 0).T

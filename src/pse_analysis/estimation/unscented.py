@@ -21,9 +21,8 @@ symmetric product from P and repairs, at the next instant, a P that rounding lef
 ``square_root`` carries a root of P by orthogonal triangularisation and takes nothing from
 anything. The former is the default because it measures better: a step takes two thirds of the time
 (``benchmarks/unscented.py``), a gate that stays closed costs nothing because S and its factor are
-there anyway, and its P stays definite by itself where the variance of every measurement is at least
-1e-12 of what the forecast expects of it, which 1e-6 p.u. is of 1 p.u. At 1e-16, and with next to no
-process noise, it is not and the filter is lost, while ``square_root`` goes on.
+there anyway, and where a measurement leaves next to nothing of a variance, so that the difference
+would be rounding, the step is taken by the root as well (`pse_analysis.estimation.conditioning`).
 """
 
 from __future__ import annotations
@@ -40,6 +39,7 @@ from scipy.linalg import blas, lapack
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.conditioning import Moments, Predicted, Prior, block
 from pse_analysis.estimation.estimator import Snapshot
+from pse_analysis.estimation.factors import symmetric
 from pse_analysis.estimation.sigma_points import SigmaPoints, Spread
 from pse_analysis.estimation.square_root import Halves
 from pse_analysis.estimation.update import Observation
@@ -112,7 +112,12 @@ def moments(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Mom
             own[block(curved, linear)] = product[entry].T
     cross[linear] = prior.P[entry]
     own[linear] = cross[:, entry].T
-    return Moments(spread.mean, own.T, cross.T, alpha, entry if first else None)
+
+    def along(given: Prior) -> tuple[FloatArray, FloatArray]:
+        found = halves(given, spread, scaling, alpha)
+        return found.odd, symmetric(found.rest)
+
+    return Moments(spread.mean, own.T, cross.T, alpha, entry if first else None, along)
 
 
 def halves(prior: Prior, spread: Spread, scaling: Scaling, alpha: float) -> Halves:

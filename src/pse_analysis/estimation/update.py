@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.estimation import robust
 from pse_analysis.estimation.conditioning import Posterior, Predicted, Prior
 from pse_analysis.estimation.deletion import Deletion, of_snapshot
 from pse_analysis.estimation.estimator import Info, Snapshot
+from pse_analysis.estimation.restart import gross_errors
 from pse_analysis.estimation.robust import Judge, Suspicion
 from pse_analysis.measurement import MeasurementModel, wrap
 from pse_analysis.vocabulary import Status
@@ -24,6 +24,11 @@ IntArray = npt.NDArray[np.int64]
 Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Predicted]
 """(prior, snapshot, rows, tuned, s) -> prediction of the rows, linearised at s where it matters."""
 
+Remainder = Callable[[Prior, IntArray, FloatArray, FloatArray, FloatArray], FloatArray]
+"""(prior, rows, s of the expansion, s that it led to, σ of the rows) -> what was left out (r,)."""
+
+FORGETTING = 1e8
+"""A gross error η gets the noise of so many η²."""
 TOLERANCE = 1e-6
 """Largest move of a voltage in the last pass of an iterated filter. [rad, p.u.]"""
 
@@ -38,11 +43,14 @@ class Observation(NamedTuple):
         Memory at the start.
     passes : int
         How often the prediction is renewed at the estimate that it led to; 1: never.
+    remainder : Remainder, optional
+        What an expansion leaves out; None where nothing is expanded.
     """
 
     predict: Observe
     tuned: float = 0.0
     passes: int = 1
+    remainder: Remainder | None = None
 
 
 class Told(NamedTuple):
@@ -151,22 +159,27 @@ def update(
     angular = model.angular[rows]
     at = prior.s
     converged = observation.passes == 1
-    verdict = None
-    if judge is not robust.none:
-        verdict = partial(_heard, judge, partial(of_snapshot, model, prior.x, rows))
+    verdict = partial(_heard, judge, partial(of_snapshot, model, prior.x, rows))
     for passes in range(1, observation.passes + 1):  # noqa: B007 (reported below)
         predicted = observation.predict(prior, snapshot, rows, tuned, at)
         eta = snapshot.z[rows] - predicted.mean
         eta[angular] = wrap(eta[angular])
         found = predicted.condition(prior, eta, R, verdict)
-        moved = np.abs(found.s - at).max()
-        at, tuned = found.s, predicted.tuned
-        if moved < TOLERANCE:
+        last, at, tuned = at, found.s, predicted.tuned
+        if np.abs(at - last).max() < TOLERANCE:
             converged = True
             break
+    if observation.remainder is not None:
+        # What the expansion leaves out is no noise, but the measurement is no surer than that.
+        left = observation.remainder(prior, rows, last, at, snapshot.sigma[rows])
+        if left.any():
+            found = predicted.condition(prior, eta, R + left**2, verdict)
     return Update(found, eta, tuned, passes, converged)
 
 
 def _heard(judge: Judge, alone: Callable[..., Deletion], found: Suspicion) -> FloatArray:
-    """A judgement that may ask the snapshot alone."""
+    """A judgement that may ask the snapshot alone, of what is not wrong beyond any doubt."""
+    gross = gross_errors(found.innovation, found.variance, found.nis)
+    if gross.any():
+        return np.where(gross, FORGETTING * found.innovation**2 / found.noise, 0.0)
     return judge(replace(found, alone=partial(alone, found.innovation, found.noise)))

@@ -29,6 +29,8 @@ from pse_analysis.measurement.layout import (
 BoolArray = npt.NDArray[np.bool_]
 Linearisation = Literal["derivative", "transform"]
 """Whether a power's row follows the voltage at its meter, or takes it as predicted."""
+BENT = 10.0
+"""How many times M σ_φ² the σ of a magnitude is at least where its phasor is taken for a whole."""
 Kept = TypeVar("Kept")
 
 
@@ -40,7 +42,7 @@ class RectangularModel:
     current: with the voltage |V|∠θ at the metered bus, e^{-jθ}c = (P - jQ)/|V|, whose covariance
     diag(σ_P², σ_Q²)/|V|² is diagonal too. A channel that lost its partner keeps its row: a
     magnitude alone is laid along the predicted angle, an angle alone is scaled by the predicted
-    magnitude.
+    magnitude. So are both where the magnitude is far more exact than its angle.
 
     The current conj(S/V) of a power moves with the voltage too, dI = conj(dS)/conj(V) -
     conj(S) conj(dV)/conj(V)². ``derivative`` has both terms in its rows, so that a power says
@@ -98,7 +100,7 @@ class RectangularModel:
             Rows that are wanted, which are available; all if not given.
         """
         rows = np.arange(len(self.layout)) if rows is None else rows
-        paired = self.paired(available)[rows]
+        paired = (self.paired(available) & self._round(z, sigma))[rows]
         pattern = self.pattern(rows, paired)
         value, spread, other = z[rows], sigma[rows], z[self.partner[rows]]
         unit = np.ones(len(rows), dtype=np.complex128)
@@ -106,6 +108,17 @@ class RectangularModel:
         unit[pattern.known] = np.exp(1j * measured)
         spread[pattern.both] *= np.maximum(np.abs(other[pattern.both]), RELATIVE_FLOOR_PU)
         return Frame(pattern, unit, pattern.sign * value, spread)
+
+    def _round(self, z: FloatArray, sigma: FloatArray) -> BoolArray:
+        """Rows whose phasor is nearly as uncertain along itself as across. (m,)
+
+        A phasor is laid along its measured angle, which is wrong by σ_φ. Its magnitude then reads
+        M σ_φ² too little, and a share σ_φ of what lies across.
+        """
+        size = np.where(self._angle, self.partner, np.arange(len(z)))
+        angle = np.where(self._angle, np.arange(len(z)), self.partner)
+        bent = np.abs(z[size]) * sigma[angle] ** 2
+        return np.asarray(~(self._angle | self._size) | (sigma[size] >= BENT * bent))
 
     def pattern(self, rows: IntArray, paired: BoolArray) -> Pattern:
         """What is common to all frames of some rows, of which some have their partner."""
