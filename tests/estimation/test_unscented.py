@@ -270,7 +270,7 @@ def test_messages_name_what_to_change() -> None:
     b = still("ieee14")
     with pytest.raises(ParameterError, match="0 < alpha ≤ 1"):
         Scaling(alpha=0.0)
-    with pytest.raises(ParameterError, match="at least one pass"):
+    with pytest.raises(ParameterError, match="expected passes in 1"):
         b.filter("ekf", passes=0)
     with pytest.raises(TableError, match=r"expected z of shape \(T, 46\)"):
         b.run(b.filter(), np.zeros((3, 4)))
