@@ -28,8 +28,6 @@ MOST = 0.25
 """Share of the measurements of a snapshot up to which they are wrong rather than the forecast."""
 ABSURD = 1e6
 """ηᵀS⁻¹η per measurement from which those that are far off are left out whatever filter it is."""
-LOST = 100.0
-"""ηᵀS⁻¹η per measurement that no filter shows for long."""
 WIDER = 3.0
 """Factor on all σ of a forecast that too many snapshots have contradicted."""
 AGREE = 0.1
@@ -141,7 +139,7 @@ class Guard:
         """Carry the state on, start again, or keep to the forecast."""
         after, info = self._tried(self.inner.step, state.inner, snapshot)
         why = info.detail if after is None else self.impossible(after, snapshot)
-        strange = state.strange + 1 if info.nis > LOST * max(info.dof, 1) else 0
+        strange = state.strange + 1 if info.nis > FAR**2 * max(info.dof, 1) else 0
         if strange >= self.params.patience:
             why = why or f"{strange} snapshots in a row contradicted the forecast"
         if after is not None and not why:
