@@ -12,16 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from endurance.flips import flips, unnoticed, uses
 
 from pse_analysis import pipeline, telemetry
 from pse_analysis.errors import DamagedFile, TableError
-from pse_analysis.pipeline import cache, cli, runner
+from pse_analysis.pipeline import cache, cli, runner, stages
 from pse_analysis.pipeline.plan import NAMES, Options, Reporter
-from pse_analysis.telemetry.parquet import MAX_ROWS
 
 CASES = Path(__file__).parent / "cases"
 SOURCE = Path(pipeline.__file__).parents[2]
@@ -178,6 +175,29 @@ def test_damaged_summary_is_not_printed(options: Options) -> None:
     assert result.ran == ("score",)
     assert "wls" in result.summary
     assert "summary.txt" in heard.texts[0]
+
+
+def test_damaged_part_of_a_worker_is_not_joined(
+    options: Options, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = stages.each
+
+    def damage(*arguments: Any) -> Any:
+        written = list(whole(*arguments))
+        path = next(iter(written[0]))
+        # In the footer, which no page's checksum covers.
+        content = path.read_bytes()
+        path.write_bytes(content[:-40] + bytes([content[-40] ^ 1]) + content[-39:])
+        return written
+
+    edit(options, 'filter = "kalman"', 'filter = "kalman"\nnoise = "scalar"')
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "each", damage)
+        with pytest.raises(DamagedFile, match=r"estimated-000-00000\.parquet is not as it was"):
+            runner.run("small", options)
+    processed = options.data_folder / "processed" / "small"
+    assert not [p for p in processed.rglob("*") if "tmp" in p.name]
+    assert runner.run("small", options).ran == ("estimate", "score")
 
 
 def test_results_of_other_parameters_are_left_out(options: Options) -> None:
@@ -350,59 +370,3 @@ def test_signal_ends_a_run_with_one_line_and_leaves_nothing(
     ]
     processed = options.data_folder / "processed" / "small"
     assert not [p for p in processed.rglob("*") if "tmp" in p.name]
-
-
-class TestFilesOfOthers:
-    """Files of others are read within bounds."""
-
-    def write(self, path: Path, table: pa.Table) -> Path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, path)
-        return path
-
-    def test_more_rows_than_the_bound(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        path = self.write(tmp_path / "t.parquet", pa.table({"a": [0] * 100}))
-        monkeypatch.setattr("pse_analysis.telemetry.parquet.MAX_ROWS", 99)
-        with pytest.raises(TableError, match="at most 99 rows, received 100: part it"):
-            telemetry.parquet.read_arrow(path)
-
-    def test_small_file_that_stands_for_very_many_rows(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("pse_analysis.telemetry.parquet.MAX_ROWS", MAX_ROWS // 100)
-        count = MAX_ROWS // 100
-        schema = pa.schema([("a", pa.dictionary(pa.int8(), pa.bool_()))])
-        path = tmp_path / "bomb.parquet"
-        zeros = pa.DictionaryArray.from_arrays(pa.array(np.zeros(count // 50 + 1, np.int8)), [True])
-        with pq.ParquetWriter(path, schema, compression="zstd") as writer:
-            for _ in range(51):
-                writer.write_table(pa.table([zeros], schema=schema))
-        assert path.stat().st_size < 2**20
-        with pytest.raises(TableError, match="rows, received"):
-            telemetry.read_table(path, "telemetry")
-
-    def test_too_many_columns(self, tmp_path: Path) -> None:
-        wide = pa.table({f"c{i}": [0] for i in range(10_001)})
-        with pytest.raises(TableError, match="at most 10000 columns, received 10001"):
-            telemetry.read_table(self.write(tmp_path / "t.parquet", wide), "channels")
-
-    def test_nested_and_repeated_columns(self, options: Options, tmp_path: Path) -> None:
-        table = pq.read_table(load(options).files["scored"])
-        nested = pa.array([[1.0]] * len(table))
-        i = table.column_names.index("value")
-        path = self.write(tmp_path / "t.parquet", table.set_column(i, "value", nested))
-        with pytest.raises(TableError, match=r"'value' of .*expected .*double.*received list<"):
-            telemetry.read_table(path, "scored")
-        twice = table.append_column("value", table.column("value"))
-        with pytest.raises(TableError, match="'value' stands 2 times"):
-            telemetry.read_table(self.write(tmp_path / "u.parquet", twice), "scored")
-
-    def test_text_that_is_not_utf8(self, options: Options, tmp_path: Path) -> None:
-        table = pq.read_table(load(options).files["scored"])
-        broken = pa.array([b"\xff\xfe"] * len(table), pa.binary()).view(pa.string())
-        i = table.column_names.index("method")
-        path = self.write(tmp_path / "t.parquet", table.set_column(i, "method", broken))
-        with pytest.raises(TableError, match=r"not UTF-8.*write it again"):
-            telemetry.read_table(path, "scored")

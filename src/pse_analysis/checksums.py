@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pse_analysis.errors import DamagedFile, TableError
-from pse_analysis.files import Facts, describe_folder, is_facts, read_json, write_json
+from pse_analysis.files import Facts, describe_folder, is_facts, read_json, unreadable, write_json
 
 CHECKSUMS = "checksums.json"
 """File in a raw folder that lists size and digest of every table in it."""
@@ -61,7 +61,7 @@ def refuse_links(folder: Path) -> None:
     Raises
     ------
     TableError
-        With the first such link.
+        With the first such link, or if this user may not look into a folder.
     """
     inside = folder.resolve()
     waiting = [folder / name for name in RAW]
@@ -76,7 +76,10 @@ def refuse_links(folder: Path) -> None:
                     f"the link, or make {folder} as a whole a link to where the data are"
                 )
         elif path.is_dir():
-            waiting += (p for p in path.iterdir() if not p.name.startswith("."))
+            try:
+                waiting += (p for p in path.iterdir() if not p.name.startswith("."))
+            except PermissionError as error:
+                raise unreadable(path, error) from error
 
 
 def write_checksums(folder: Path) -> None:

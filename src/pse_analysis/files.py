@@ -120,7 +120,7 @@ def read_json(path: Path) -> dict[str, Any]:
             return {}
         value = json.loads(path.read_text(encoding="utf-8"))
     except PermissionError as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
     except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
@@ -236,7 +236,7 @@ def check(path: Path, facts: Facts, remedy: str) -> None:
     try:
         received = digest_file(path)
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
     if received != facts["digest"]:
         raise DamagedFile(
             f"{path} is not as it was written (expected digest {facts['digest']}, received "
@@ -256,7 +256,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
     def refuse(error: OSError) -> None:
         if not isinstance(error, FileNotFoundError):
-            raise _unreadable(Path(error.filename), error) from error
+            raise unreadable(Path(error.filename), error) from error
 
     for root, folders, names in os.walk(folder, onerror=refuse):
         folders[:] = [name for name in folders if not name.startswith(".")]
@@ -292,11 +292,12 @@ def describe_folder(
         try:
             found[name] = dict(facts) if same else describe(path)
         except PermissionError as error:
-            raise _unreadable(path, error) from error
+            raise unreadable(path, error) from error
     return found
 
 
-def _unreadable(path: Path, error: OSError) -> TableError:
+def unreadable(path: Path, error: OSError) -> TableError:
+    """The error to raise where this user may not read a file or folder."""
     return TableError(f"{path} cannot be read ({error.strerror}): check its owner and mode")
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 from fake_work import CASE, WORK, change, edit, prepare
 
+from pse_analysis.checksums import RAW
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.pipeline import cli, runner
 from pse_analysis.pipeline.cache import CacheError
-from pse_analysis.pipeline.plan import NAMES, Job, Options, Reporter
+from pse_analysis.pipeline.plan import NAMES, STAGES, Job, Options, Reporter
 
 RUN = runner.run
 
@@ -112,6 +113,10 @@ def test_raw_data_of_the_user_is_used_and_its_changes_are_seen(options: Options)
     assert runner.run("small", options, work=WORK).ran == ("validate",)
     with pytest.raises(ParameterError, match="nothing to simulate"):
         runner.run("small", change(options, only="simulate"), work=WORK)
+
+
+def test_files_of_the_raw_folder_are_those_that_stages_read() -> None:
+    assert set(RAW) == {name for stage in STAGES for name in stage.raw}
 
 
 def test_raw_data_without_marker_is_not_simulated_over(options: Options) -> None:

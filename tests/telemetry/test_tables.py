@@ -15,6 +15,10 @@ from simulated_case import case
 
 from pse_analysis import telemetry
 from pse_analysis.errors import TableError
+from pse_analysis.files import describe
+from pse_analysis.pipeline.descent import inputs
+from pse_analysis.pipeline.plan import STAGES
+from pse_analysis.pipeline.raw_folder import RawFolder
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +130,94 @@ def test_an_interrupted_writer_leaves_nothing_that_can_be_run(
         telemetry.read_raw(folder)
     telemetry.write_raw(folder, case())
     assert len(telemetry.read_raw(folder).telemetry) == len(case().telemetry)
+
+
+def test_writer_that_was_interrupted_beside_files_of_others_may_write_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "NOTES.md").write_text("mine")
+    move = Path.replace
+
+    def stop(path: Path, target: Path) -> Path:
+        if path.name == "telemetry":
+            raise KeyboardInterrupt
+        return move(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", stop)
+        with pytest.raises(KeyboardInterrupt):
+            telemetry.write_raw(folder, case())
+    assert not (folder / "telemetry").exists()
+    with pytest.raises(TableError, match=r"is there already and is not overwritten"):
+        telemetry.write_raw(folder, dataclasses.replace(case(), truth=case().truth[1:]))
+    telemetry.write_raw(folder, case())
+    assert telemetry.read_raw(folder).telemetry.shape == case().telemetry.shape
+    assert (folder / "NOTES.md").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["case"]
+
+
+def test_raw_case_is_written_into_folders_only(tmp_path: Path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(TableError, match="is not a folder: choose another name"):
+        telemetry.write_raw(tmp_path / "file", case())
+    with pytest.raises(TableError, match="leads back to itself"):
+        telemetry.write_raw(tmp_path / "circle", case())
+
+
+def test_notes_beside_accepted_tables_may_change(written: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(written, tmp_path / "case"))
+    (folder / "NOTES.md").write_text("one")
+    (folder / "telemetry" / "notes.txt").write_text("one")
+    telemetry.accept(folder)
+    (folder / "NOTES.md").write_text("two")
+    (folder / "telemetry" / "notes.txt").unlink()
+    raw = RawFolder(folder)
+    raw.check(raw.describe())
+    telemetry.read_raw(folder)
+
+
+def test_change_of_what_a_simulation_wrote_is_not_accepted(written: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(written, tmp_path / "case"))
+    (folder / "simulated.json").write_text("{}")
+    with pytest.raises(TableError, match=r"was made by a simulation.*--force.*to keep your change"):
+        telemetry.accept(folder)
+
+
+def test_what_counts_as_changed_is_what_is_read(folder: Path):
+    hidden = one_file(folder).with_name("._part-0.parquet")
+    hidden.write_bytes(b"left by a file manager")
+    before = telemetry.read_raw(folder).telemetry
+    assert hidden.relative_to(folder).as_posix() not in RawFolder(folder).describe()
+    shutil.copy(one_file(folder), folder / "telemetry" / "a copy.parquet")
+    assert telemetry.read_raw(folder).telemetry.equals(before)
+
+
+def test_linked_folder_of_telemetry_is_refused_rather_than_left_out(folder: Path, tmp_path: Path):
+    source = folder / "telemetry" / "source=pmu"
+    source.rename(tmp_path / "elsewhere")
+    source.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(TableError, match=r"source=pmu is a link to .*copy it there"):
+        telemetry.read_raw(folder)
+    source.unlink()
+    (tmp_path / "elsewhere").rename(source)
+    (folder / "telemetry" / "plots").symlink_to(tmp_path)
+    telemetry.read_raw(folder)
+
+
+def test_same_pages_under_another_unit_are_another_input(tmp_path: Path):
+    path, found = tmp_path / "telemetry" / "t.parquet", []
+    path.parent.mkdir()
+    for unit in ("us", "ms"):
+        times = pa.array([1, 2, 3]).cast(pa.timestamp(unit, "UTC"))
+        pq.write_table(pa.table({"time_utc": times}), path, store_schema=False)
+        found.append(describe(path))
+    assert found[0]["content"] == found[1]["content"]
+    validate = next(stage for stage in STAGES if stage.name == "validate")
+    one, two = (inputs(validate, {"telemetry/t.parquet": facts}, {}) for facts in found)
+    assert one != two
 
 
 def test_missing_folder(tmp_path: Path):

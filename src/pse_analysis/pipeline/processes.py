@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
@@ -45,32 +45,42 @@ def each(function: Callable[[Task], Done], tasks: Sequence[Task], workers: int) 
     if workers <= 1:
         yield from map(function, tasks)
         return
-    # Each worker is one thread: several of them with BLAS threads of their own would fight for
-    # the same cores. The setting is read when numpy is imported, hence from the environment that
-    # the workers inherit, and hence spawn: a forked child would have numpy imported already.
-    threads = dict.fromkeys(THREADS, "1")
-    before = {name: os.environ.get(name) for name in threads}
-    os.environ.update(threads)
     others = multiprocessing.active_children()
-    pool = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
-    )
-    try:
+    with _one_thread_each(), ExitStack() as stack:
+        # Each in a block of its own: the first starts Python's tracker of resources, which opens
+        # it.
+        with _signals_waiting():
+            pool = ProcessPoolExecutor(
+                workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
+            )
+            stack.callback(_end, pool, others)
         with _signals_waiting():
             futures = [pool.submit(function, task) for task in tasks]
-        for future in as_completed(futures):
-            yield future.result()
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise OutOfMemory(
+                "a process for the estimators ended suddenly, as when the system ends one because "
+                f"memory runs out: run again with fewer of them (--workers 1, now {workers}), or "
+                "with a shorter [study] or history_s, fewer trials, fewer methods"
+            ) from error
         pool.shutdown()
-    except BrokenProcessPool as error:
-        raise OutOfMemory(
-            "a process for the estimators ended suddenly, as when the system ends one because "
-            f"memory runs out: run again with fewer of them (--workers 1, now {workers}), or with "
-            "a shorter [study] or history_s, fewer trials, fewer methods"
-        ) from error
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes that are started use one thread.
+
+    Several with BLAS threads of their own would fight for the same cores. The setting is read when
+    numpy is imported, hence from the environment that the workers inherit, and hence spawn: a
+    forked child would have numpy imported already.
+    """
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
     finally:
-        # Do not wait for estimates that nobody will read.
-        pool.shutdown(wait=False, cancel_futures=True)
-        _end([child for child in multiprocessing.active_children() if child not in others])
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -91,7 +101,11 @@ def _signals_waiting() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _end(processes: Sequence[BaseProcess]) -> None:
+def _end(pool: ProcessPoolExecutor, others: Sequence[BaseProcess]) -> None:
+    """End the processes of a pool; those that were there before are others'."""
+    # Do not wait for estimates that nobody will read.
+    pool.shutdown(wait=False, cancel_futures=True)
+    processes = [child for child in multiprocessing.active_children() if child not in others]
     for process in processes:
         process.terminate()
     for process in processes:
