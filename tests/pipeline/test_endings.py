@@ -86,6 +86,22 @@ def test_second_signal_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert done == ["cleaned up"]
 
 
+def test_what_a_signal_left_half_made_complains_to_nobody(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class HalfMade:
+        def __init__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            self.stream = 1
+
+        def __del__(self) -> None:
+            assert self.stream == 1
+
+    monkeypatch.setattr(runner, "run", lambda *_: HalfMade())
+    assert cli.main(["run", "small"]) == 143
+    assert capsys.readouterr().err.strip() == str(Ended(signal.SIGTERM))
+
+
 def test_ignored_signal_stays_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with endings.by_signal():

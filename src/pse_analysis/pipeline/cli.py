@@ -234,7 +234,8 @@ def _guarded(arguments: Sequence[str] | None) -> int:
         endings.check()
         return code
     except (endings.Ended, KeyboardInterrupt) as reason:
-        ended = endings.Ended(signal.SIGINT) if isinstance(reason, KeyboardInterrupt) else reason
+        # A new one: kept in a variable here, the raised one would hold what it interrupted.
+        ended = endings.Ended(getattr(reason, "number", signal.SIGINT))
         print(f"\n{ended}", file=sys.stderr)
         return ended.code
     except BrokenPipeError:

@@ -61,8 +61,9 @@ def by_signal() -> Iterator[None]:
             raise Ended(number)
 
     def report(unraisable: Any) -> None:
-        # Raised where nothing could be raised; `check` raises it again.
-        if unraisable.exc_type is not Ended:
+        # What came where nothing can be raised `check` raises again; what a signal left half made
+        # may complain when it is removed.
+        if not _received:
             sys.__unraisablehook__(unraisable)
 
     # Only the main thread may say what a signal does.
