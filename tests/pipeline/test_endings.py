@@ -18,6 +18,7 @@ from pse_analysis.pipeline.endings import CODES, Ended
 from pse_analysis.pipeline.processes import each
 
 NUMBERS = tuple(CODES)
+PATIENCE_S = 10.0
 
 
 @pytest.fixture(autouse=True)
@@ -155,6 +156,10 @@ def test_workers_end_with_the_run(number: signal.Signals, tmp_path: Path) -> Non
     _, errors = process.communicate(timeout=60)
     assert process.returncode == CODES[number]
     assert errors.strip().splitlines() == [str(Ended(number))]
+    # Python's tracker of resources ends by itself once the last that it served is gone.
+    patience = time.monotonic() + PATIENCE_S
+    while alive(process.pid) and time.monotonic() < patience:
+        time.sleep(0.05)
     assert alive(process.pid) == []
 
 
