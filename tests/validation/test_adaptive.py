@@ -169,6 +169,16 @@ def test_a_step_is_accepted_after_more_than_six_samples_that_agree():
     assert not found.released[:, 1].any()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_window_longer_than_the_patience_still_accepts_a_step(kind: str):
+    z = voltage(m=2)
+    z[200:, 0] += 0.5
+    found = screen(z, SIGMA, AdaptiveParams(threshold=kind, window=40))
+    assert not found.flagged[300:, 0].any()
+    assert np.isfinite(found.value[201:]).all()
+    assert np.abs(found.value - z)[300:].max() < 0.06
+
+
 def test_an_angle_that_passes_its_turn_is_no_jump():
     rng = np.random.default_rng(SEED)
     angle = np.linspace(0, 8 * np.pi, 400) + rng.normal(0, 0.002, 400)

@@ -248,7 +248,10 @@ def step(
     waiting = (*state.seen, seen._replace(size=size, learns=present & learns))
     choice = state.choice
     if released.any():
-        values[:, released] = suspects[-len(values) :, released]
+        # A window may be longer than the run that released it: what came before is forgotten.
+        kept = min(len(values), len(suspects))
+        values[:, released] = np.nan
+        values[-kept:, released] = suspects[-kept:, released]
         # What was seen of them before tells no more how well a forecast serves.
         waiting = tuple(step._replace(present=step.present & ~released) for step in waiting)
         choice = choice.begun_again(released, suspects)
