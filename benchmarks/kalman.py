@@ -9,12 +9,14 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from benchmarks.timing import Row, alternate
-from pse_analysis.estimation import intervals, matching, refusal, screening
-from pse_analysis.estimation.estimator import Estimator, Snapshot
-from pse_analysis.estimation.holt import local_trend
-from pse_analysis.estimation.kalman import KalmanState, kalman_filter
-from pse_analysis.estimation.process import LoadStatistics, ProcessNoise, load_noise
-from pse_analysis.estimation.records import Record
+from pse_analysis.estimation.bad_data import adaptive_threshold, innovation_test
+from pse_analysis.estimation.core.interface import Estimator, Snapshot
+from pse_analysis.estimation.core.snapshots import Record
+from pse_analysis.estimation.filters import intervals
+from pse_analysis.estimation.filters.kalman import KalmanState, kalman_filter
+from pse_analysis.estimation.process import covariance_matching
+from pse_analysis.estimation.process.dynamics import local_trend
+from pse_analysis.estimation.process.load_noise import LoadStatistics, ProcessNoise, load_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import (
@@ -61,17 +63,17 @@ def run() -> list[Row]:
     note = "ours also transforms the measurements and makes Q"
     rows.append(Row("Kalman step, ieee33, as of the instant", *times, "filterpy", note))
     for name, plain, options in (
-        ("screened by innovation", instant, {"instant": True, "refuse": refusal.refuse()}),
+        ("screened by innovation", instant, {"instant": True, "refuse": innovation_test.refuse()}),
         (
             "over intervals, screened by innovation",
             interval,
-            {"reach_s": LAGS * STEP_S, "refuse": refusal.refuse()},
+            {"reach_s": LAGS * STEP_S, "refuse": innovation_test.refuse()},
         ),
         ("local trend", instant, {"instant": True, "process": local_trend()}),
     ):
         rows.append(beside(name, made(layout, noise, **options), plain, now))
     rows.append(behind_threshold(layout, instant))
-    learning = made(layout, matching.of_loads(NETWORK), instant=True)
+    learning = made(layout, covariance_matching.of_loads(NETWORK), instant=True)
     rows.append(beside("noise from innovations", learning, instant, now))
     state, _ = interval.init(now)
     times = alternate(lambda: interval.read(state), lambda: interval.step(state, now), REPEATS)
@@ -122,7 +124,7 @@ def behind_threshold(layout: SensorLayout, plain: Estimator) -> Row:
     """A day of steps behind the adaptive threshold of every channel beside the same without it."""
     days = series(layout, 2 * STEPS)
     past, snapshots = days.between(None, NOON), list(days.between(NOON, None).snapshots())
-    ours = screening.screened(plain, layout, AdaptiveParams(), past)
+    ours = adaptive_threshold.screened(plain, layout, AdaptiveParams(), past)
 
     def through(estimator: Estimator) -> Callable[[], None]:
         begun = estimator.init(snapshots[0])[0]

@@ -12,10 +12,10 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from scipy.linalg import blas
 
 from benchmarks.timing import Row, alternate
-from pse_analysis.estimation.composition import Composition, compose, scalar
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.gaussian import GaussianFilter
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.filters.composition import Composition, compose, scalar
+from pse_analysis.estimation.filters.recursion import GaussianFilter
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VA, VM, P, Q, SensorLayout

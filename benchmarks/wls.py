@@ -10,7 +10,7 @@ import pandas as pd
 
 from benchmarks.grid import pandapower_case
 from benchmarks.timing import Row, alternate
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pse_analysis.estimation.composition import Composition, compose, scalar
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.gaussian import GaussianFilter
-from pse_analysis.estimation.replay import EPOCH, Replay, replay
-from pse_analysis.estimation.wls import state_columns
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.core.run_arrays import EPOCH, ArrayRun, run_arrays
+from pse_analysis.estimation.filters.composition import Composition, compose, scalar
+from pse_analysis.estimation.filters.recursion import GaussianFilter
+from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
@@ -72,9 +72,9 @@ class Bench:
         """Measurements of every instant, with noise. (T, m)"""
         return np.asarray(self.exact + self.layout.sigma * rng.standard_normal(self.exact.shape))
 
-    def run(self, made: GaussianFilter, z: np.ndarray) -> Replay:
+    def run(self, made: GaussianFilter, z: np.ndarray) -> ArrayRun:
         """The filter's day, from the true state."""
-        return replay(made, self.truth[0], self.start, z, self.layout.sigma)
+        return run_arrays(made, self.truth[0], self.start, z, self.layout.sigma)
 
     def snapshot(self, z: np.ndarray, available: np.ndarray | None = None) -> Snapshot:
         """A snapshot of fresh values."""

@@ -32,7 +32,7 @@ NAMES = (
     "a:b/c",
     "Übergabe Ω €",
 )
-METHOD = Method("<b>wls</b>|../../x", "wls")
+METHOD = Method.of("<b>wls</b>|../../x", "wls")
 
 
 def hostile() -> tiny_case.Run:

@@ -124,7 +124,7 @@ def test_parameters_are_frozen() -> None:
 def test_method_of_a_case_file_is_built_and_a_misspelt_filter_refused() -> None:
     data = {"methods": [{"name": "kf", "filter": "kalman", "noise": "scalar", "variance": 1}]}
     built = build(EstimateParams, data, "estimate").methods[0]
-    assert built == Method("kf", "kalman", "scalar", 1.0)
+    assert built == Method.of("kf", "kalman", noise="scalar", variance=1.0)
     data["methods"][0]["filter"] = "kallman"
     with pytest.raises(ParameterError, match=r"methods\[0\].filter\].*'kalman'.*'kallman'"):
         build(EstimateParams, data, "estimate")

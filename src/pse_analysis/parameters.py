@@ -11,7 +11,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Annotated, Any, TypeVar
@@ -118,9 +118,16 @@ def build(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     ------
     ParameterError
         On an unknown or missing key or a value of another type; the message names the remedy.
+
+    Notes
+    -----
+    A class method ``chosen(data, where)`` of ``cls`` may name the subclass that is built instead.
     """
     if not isinstance(data, Mapping):
         raise _wrong(where, cls, data)
+    # A class of which there are several kinds finds the one that is meant.
+    choose: Callable[..., type[T]] | None = getattr(cls, "chosen", None)
+    cls = cls if choose is None else choose(data, where)
     hints = typing.get_type_hints(cls, include_extras=True)
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in data:
@@ -209,6 +216,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             )
         return value
     if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and isinstance(value, hint):
+            return value
         if not isinstance(value, Mapping):
             raise _wrong(where, hint, value)
         return build(typing.cast(type[Any], hint), value, where)

@@ -10,7 +10,7 @@ from simulated_case import STUDY, feeder
 
 from pse_analysis.alignment import AlignParams, Variant, align, pseudo_measurements
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.records import record
+from pse_analysis.estimation.core.snapshots import record
 from pse_analysis.measurement import SensorLayout
 from pse_analysis.validation import validate
 

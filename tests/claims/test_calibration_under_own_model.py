@@ -11,10 +11,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.kalman import KalmanState, kalman_filter
-from pse_analysis.estimation.process import LoadStatistics, load_noise
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.filters.kalman import KalmanState, kalman_filter
+from pse_analysis.estimation.process.load_noise import LoadStatistics, load_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve

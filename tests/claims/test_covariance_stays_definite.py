@@ -16,8 +16,8 @@ import pandas as pd
 import pytest
 from qu_bench import Bench, paper_layout
 
-from pse_analysis.estimation import conditioning
-from pse_analysis.estimation.conditioning import Prior
+from pse_analysis.estimation.filters import conditioning
+from pse_analysis.estimation.filters.conditioning import Prior
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import VA, VM, MeasurementModel

@@ -15,16 +15,18 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pse_analysis.estimation import composition, matching, refusal
-from pse_analysis.estimation.composition import Composition
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.estimator import Estimator, Info, Snapshot
-from pse_analysis.estimation.holt import local_trend
-from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.noise import of_grid
-from pse_analysis.estimation.process import LoadStatistics, load_noise, scalar_noise
-from pse_analysis.estimation.restart import guarded
-from pse_analysis.estimation.wls import state_columns
+from pse_analysis.estimation.bad_data import innovation_test
+from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.filters import composition
+from pse_analysis.estimation.filters.composition import Composition
+from pse_analysis.estimation.filters.kalman import kalman_filter
+from pse_analysis.estimation.filters.restart import guarded
+from pse_analysis.estimation.process import covariance_matching
+from pse_analysis.estimation.process.dynamics import local_trend
+from pse_analysis.estimation.process.load_noise import LoadStatistics, load_noise, scalar_noise
+from pse_analysis.estimation.process.sage_husa import of_grid
+from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.grid import library
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.power_flow import solve
@@ -116,8 +118,8 @@ def composed(kind: str, **choice: object) -> Estimator:
 FILTERS: dict[str, Callable[[], Estimator]] = {
     "kalman": kalman,
     "kalman scalar": lambda: kalman(scalar_noise(NETWORK, 1e-6)),
-    "kalman refusing": lambda: kalman(refuse=refusal.refuse()),
-    "kalman matching": lambda: kalman(matching.of_loads(NETWORK)),
+    "kalman refusing": lambda: kalman(refuse=innovation_test.refuse()),
+    "kalman matching": lambda: kalman(covariance_matching.of_loads(NETWORK)),
     "kalman lagged": lambda: kalman(reach_s=120.0),
     "kalman trend": lambda: kalman(process=local_trend()),
     "ekf": lambda: composed("ekf"),

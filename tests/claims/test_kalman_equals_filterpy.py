@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.process import LoadStatistics, load_noise
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.filters.kalman import kalman_filter
+from pse_analysis.estimation.process.load_noise import LoadStatistics, load_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, FROM, IA, IM, VA, VM, MeasurementModel, SensorLayout

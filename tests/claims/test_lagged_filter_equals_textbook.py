@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from reference import kalman_step
 
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.holt import Process, holt, local_trend, random_walk
-from pse_analysis.estimation.intervals import bridge_covariance, weights
-from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.process import LoadStatistics, load_noise
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.filters.intervals import bridge_covariance, weights
+from pse_analysis.estimation.filters.kalman import kalman_filter
+from pse_analysis.estimation.process.dynamics import Process, holt, local_trend, random_walk
+from pse_analysis.estimation.process.load_noise import LoadStatistics, load_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import (

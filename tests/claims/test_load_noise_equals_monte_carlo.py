@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pse_analysis.estimation.process import LoadStatistics, load_noise
+from pse_analysis.estimation.process.load_noise import LoadStatistics, load_noise
 from pse_analysis.grid import BusKind, library
 from pse_analysis.grid.power_flow import solve
 

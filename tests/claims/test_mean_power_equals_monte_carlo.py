@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pse_analysis.estimation.conditioning import Prior
-from pse_analysis.estimation.unscented import PowerMean
+from pse_analysis.estimation.filters.conditioning import Prior
+from pse_analysis.estimation.filters.unscented import PowerMean
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, FROM, TO, VM, MeasurementModel, P, Q, SensorLayout

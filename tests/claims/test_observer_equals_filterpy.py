@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from pse_analysis.estimation.estimator import Snapshot
+from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.estimation.machine import observer
 from pse_analysis.machine import Densities, Machine, sample
 from pse_analysis.simulation.machine import disturb

@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pse_analysis.estimation import composition
-from pse_analysis.estimation.composition import Composition
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.estimator import Estimator, Snapshot
-from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.noise import of_grid
-from pse_analysis.estimation.process import LoadStatistics, load_noise
-from pse_analysis.estimation.wls import state_columns
+from pse_analysis.estimation.core.interface import Estimator, Snapshot
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.filters import composition
+from pse_analysis.estimation.filters.composition import Composition
+from pse_analysis.estimation.filters.kalman import kalman_filter
+from pse_analysis.estimation.process.load_noise import LoadStatistics, load_noise
+from pse_analysis.estimation.process.sage_husa import of_grid
+from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.grid import library
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network

@@ -33,7 +33,7 @@ AT = 15
 """Position of the wrong sample in its channel: five minutes into the study."""
 QUANTITIES = ("vm_pu", "va_degree", "p_mw", "q_mvar", "i_ka", "ia_degree")
 GRIDS = ("ieee33", "own on 1 MVA", "own on 10 MVA", "own on 100 MVA", "own without loads")
-METHOD = Method("kf", "kalman", noise="scalar", variance=1e-6)
+METHOD = Method.of("kf", "kalman", noise="scalar", variance=1e-6)
 
 
 def own_grid(base_mva: float) -> Network:

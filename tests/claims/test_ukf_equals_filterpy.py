@@ -7,8 +7,8 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from qu_bench import VARIANCE, still
 
-from pse_analysis.estimation.replay import EPOCH
-from pse_analysis.estimation.unscented import Scaling
+from pse_analysis.estimation.core.run_arrays import EPOCH
+from pse_analysis.estimation.filters.unscented import Scaling
 
 SEED = 1
 ALPHA, BETA = 0.85, 0.05

@@ -7,10 +7,10 @@ import pytest
 from qu_bench import VARIANCE
 from reference import kalman_step
 
-from pse_analysis.estimation.composition import Composition, compose, scalar
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.replay import EPOCH
-from pse_analysis.estimation.unscented import Scaling
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.core.run_arrays import EPOCH
+from pse_analysis.estimation.filters.composition import Composition, compose, scalar
+from pse_analysis.estimation.filters.unscented import Scaling
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VA, VM, SensorLayout

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reference import pandapower_wls
 
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, FROM, TO, VM, MeasurementModel, P, Q, SensorLayout

@@ -25,9 +25,9 @@ HISTORY = 24
 STUDY = Study(START, START + timedelta(seconds=STEPS * STEP_S), STEP_S, HISTORY * STEP_S)
 
 METHODS = (
-    Method("wls", "wls"),
-    Method("kalman_load", "kalman", noise="load"),
-    Method("kalman_scalar", "kalman", noise="scalar", screening="innovation"),
+    Method.of("wls", "wls"),
+    Method.of("kalman_load", "kalman", noise="load"),
+    Method.of("kalman_scalar", "kalman", noise="scalar", screening="innovation"),
 )
 """Static, and two of the filters; the work of the others is tried in their own tests."""
 

@@ -11,11 +11,11 @@ from tests.endurance import tiny_case
 from pse_analysis.estimation import Method
 
 METHODS = (
-    Method("wls", "wls"),
-    Method("kalman", "kalman"),
-    Method("matched", "kalman", noise="innovation"),
-    Method("ukf", "ukf", noise="scalar"),
-    Method("ekf", "ekf"),
+    Method.of("wls", "wls"),
+    Method.of("kalman", "kalman"),
+    Method.of("matched", "kalman", noise="innovation"),
+    Method.of("ukf", "ukf", noise="scalar"),
+    Method.of("ekf", "ekf"),
 )
 
 

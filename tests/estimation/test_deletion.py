@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from qu_bench import still
 
-from pse_analysis.estimation.deletion import Deletion, of_snapshot
+from pse_analysis.estimation.bad_data.identification import Deletion, of_snapshot
 
 SEED = 7
 PRICE = 20.0
@@ -78,7 +78,7 @@ def test_accusation_is_the_standing_of_the_left_out_ones() -> None:
     S, eta = correlated()
     d = deletion(S, eta)
     out = np.array([3, 7, 8])
-    error, variance = d.accusation(out)
+    error, variance = d.error_estimate(out)
     expected = d.without(chosen(12, *out))
     np.testing.assert_allclose(error, expected.error[out])
     np.testing.assert_allclose(variance, expected.variance[out])

@@ -12,13 +12,14 @@ import pytest
 from reference import channels_table
 
 from pse_analysis.errors import NotConverged, TableError
-from pse_analysis.estimation import Method, estimate, load_learning
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.estimator import Estimator, Info, Snapshot, Voltages
-from pse_analysis.estimation.kalman import KalmanState, kalman_filter
-from pse_analysis.estimation.process import scalar_noise
-from pse_analysis.estimation.records import Record, record
-from pse_analysis.estimation.tracking import tracking_wls
+from pse_analysis.estimation import Method, estimate
+from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.core.snapshots import Record, record
+from pse_analysis.estimation.filters.kalman import KalmanState, kalman_filter
+from pse_analysis.estimation.process import learn_from_history
+from pse_analysis.estimation.process.load_noise import scalar_noise
+from pse_analysis.estimation.static.tracking import tracking_wls
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VM, MeasurementModel, P, Q, SensorLayout
@@ -44,7 +45,7 @@ CHANNELS = channels_table(
 )
 LAYOUT = SensorLayout.from_channels(CHANNELS, NETWORK)
 TRUTH = solve(NETWORK).x
-METHODS = [Method("wls", "wls"), Method("kf", "kalman", "scalar", 1e-7)]
+METHODS = [Method.of("wls", "wls"), Method.of("kf", "kalman", noise="scalar", variance=1e-7)]
 
 
 def study(instants: int, history_s: float = 0.0) -> Study:
@@ -310,8 +311,10 @@ def test_a_method_that_history_teaches_nothing_says_so_and_does_not_stop_the_oth
     def lost(*_args: object, **_options: object) -> None:
         raise NotConverged("no power flow at the usual loads")
 
-    monkeypatch.setattr(load_learning, "learn_load", lost)
-    got = estimate(telemetry(3), CHANNELS, NETWORK, study(3), Method("kf", "kalman", "load"))
+    monkeypatch.setattr(learn_from_history, "learn_load", lost)
+    got = estimate(
+        telemetry(3), CHANNELS, NETWORK, study(3), Method.of("kf", "kalman", noise="load")
+    )
     assert set(got.steps["status"]) == {"not_converged"}
     assert got.steps["detail"].str.contains("no power flow at the usual loads").all()
     assert got.estimated["value"].isna().all()

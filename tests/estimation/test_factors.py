@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from qu_bench import still
 
-from pse_analysis.estimation.conditioning import Moments, Prior
-from pse_analysis.estimation.factors import (
+from pse_analysis.estimation.bad_data.robust import InnovationStats
+from pse_analysis.estimation.core.cholesky import (
     Columns,
     Root,
     cholesky,
@@ -17,8 +17,8 @@ from pse_analysis.estimation.factors import (
     solve,
     squared_inverse,
 )
-from pse_analysis.estimation.replay import EPOCH
-from pse_analysis.estimation.robust import Suspicion
+from pse_analysis.estimation.core.run_arrays import EPOCH
+from pse_analysis.estimation.filters.conditioning import Moments, Prior
 from pse_analysis.measurement import VA, VM
 
 SEED = 3
@@ -76,7 +76,7 @@ def test_measurements_of_the_state_itself_need_no_inverse() -> None:
     own, cross = np.asfortranarray(H @ P @ H.T), np.asfortranarray(P @ H.T)
     seen: list[np.ndarray] = []
 
-    def verdict(found: Suspicion) -> np.ndarray:
+    def verdict(found: InnovationStats) -> np.ndarray:
         seen.append(found.root.precision())
         return np.zeros(7)
 

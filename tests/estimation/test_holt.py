@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.holt import HoltParams, holt, local_trend, random_walk
+from pse_analysis.estimation.process.dynamics import HoltParams, holt, local_trend, random_walk
 
 ALPHA, BETA = 0.85, 0.05
 SEED = 5

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pse_analysis.estimation.intervals import bridge_covariance, covered, kinds, weights
+from pse_analysis.estimation.filters.intervals import bridge_covariance, covered, kinds, weights
 
 SEED = 17
 STEP_S = 300.0

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from pse_analysis import parameters
-from pse_analysis.estimation import Method, build
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.estimator import Estimator, Info, Snapshot
-from pse_analysis.estimation.kalman import KalmanState, kalman_filter
-from pse_analysis.estimation.process import scalar_noise
-from pse_analysis.estimation.records import Record
+from pse_analysis.estimation import Method, Setting
+from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.core.snapshots import Record
+from pse_analysis.estimation.filters.kalman import KalmanState, kalman_filter
+from pse_analysis.estimation.process.load_noise import scalar_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
@@ -209,7 +209,7 @@ def test_filter_of_a_case_file_forecasts_and_estimates_its_noise(
     m = len(b.layout)
     no, off = np.zeros((0, m)), np.zeros((0, m), dtype=bool)
     history = Record(np.zeros(0, dtype="datetime64[us]"), no, no, no, off, off, no)
-    made = build(method, b.network, b.layout, study, history)
+    made = method.estimator(Setting(b.network, b.layout, study, history))
     state, _ = made.init(b.snapshot(0))
     assert len(state.inner.x) == 2 * b.network.n_bus * (2 if process == "local_trend" else 1)
     for k in range(1, 12):

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pse_analysis.estimation import refusal
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.holt import Process, holt, local_trend, random_walk
-from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.process import scalar_noise
+from pse_analysis.estimation.bad_data import innovation_test
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.filters.kalman import kalman_filter
+from pse_analysis.estimation.process.dynamics import Process, holt, local_trend, random_walk
+from pse_analysis.estimation.process.load_noise import scalar_noise
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
@@ -36,12 +36,12 @@ def metered(network: Network) -> SensorLayout:
         (random_walk(), None, 3000),
         (holt(), None, 500),
         (local_trend(), None, 500),
-        (random_walk(), refusal.refuse(), 500),
+        (random_walk(), innovation_test.refuse(), 500),
     ],
     ids=["walk", "holt", "trend", "screened"],
 )
 def test_covariance_stays_symmetric_and_positive_over_a_long_run(
-    process: Process, refuse: refusal.Refuse | None, steps: int
+    process: Process, refuse: innovation_test.Refuse | None, steps: int
 ) -> None:
     """σ from 1e-8 (injections that are exactly zero) to 1, meters that come and go, old samples."""
     network = library.load("ieee14")

@@ -131,13 +131,13 @@ def test_riccati_covariance_is_the_lyapunov_covariance_of_the_matched_gain() -> 
 @pytest.mark.parametrize("step_s", [None, 0.01, 0.1])
 def test_error_is_least_at_the_true_ratio(step_s: float | None) -> None:
     ratios = 50.0 * np.geomspace(1e-4, 1e4, 33)
-    tuned = tune(MACHINE, TRUE, ratios, step_s)
-    assert tuned.ratio == pytest.approx(50.0)
-    for of_state in tuned.rms.T:
+    alpha = tune(MACHINE, TRUE, ratios, step_s)
+    assert alpha.ratio == pytest.approx(50.0)
+    for of_state in alpha.rms.T:
         assert ratios[np.argmin(of_state)] == pytest.approx(50.0)
-    assert (tuned.cost[np.arange(33) != 16] > 0).all()
-    assert tuned.cost[16] == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(tuned.gains[16], tuned.gain, rtol=1e-9)
+    assert (alpha.cost[np.arange(33) != 16] > 0).all()
+    assert alpha.cost[16] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(alpha.gains[16], alpha.gain, rtol=1e-9)
 
 
 def test_checks_say_which_condition_fails_why_and_what_to_do() -> None:

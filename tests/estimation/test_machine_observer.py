@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.estimator import Info, Snapshot
+from pse_analysis.estimation.core.interface import Info, Snapshot
 from pse_analysis.estimation.machine import (
     ObserverState,
     Poles,

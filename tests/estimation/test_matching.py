@@ -9,10 +9,11 @@ import pytest
 from scipy import integrate
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import Method, matching
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.kalman import KalmanState, kalman_filter
-from pse_analysis.estimation.matching import Matching
+from pse_analysis.estimation import Method
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.filters.kalman import KalmanState, kalman_filter
+from pse_analysis.estimation.process import covariance_matching
+from pse_analysis.estimation.process.covariance_matching import CovarianceMatching
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VA, VM, P, Q, SensorLayout
@@ -53,7 +54,7 @@ def snapshots(levels: np.ndarray, steps: int, seed: int) -> list[Snapshot]:
     ]
 
 
-def run(made: Matching, taken: list[Snapshot]) -> list[KalmanState]:
+def run(made: CovarianceMatching, taken: list[Snapshot]) -> list[KalmanState]:
     estimator = kalman_filter("kf", NETWORK, metered(), made, step_s=STEP_S)
     state, _ = estimator.init(taken[0])
     states = [state]
@@ -71,7 +72,9 @@ def run(made: Matching, taken: list[Snapshot]) -> list[KalmanState]:
 def test_levels_of_the_truth_are_found(levels: np.ndarray) -> None:
     """σ of each shape, mean over the last hours of four histories, within a quarter."""
     found = [
-        np.mean([s.noise.level for s in run(matching.of_loads(NETWORK), taken)[48:]], axis=0)
+        np.mean(
+            [s.noise.level for s in run(covariance_matching.of_loads(NETWORK), taken)[48:]], axis=0
+        )
         for taken in (snapshots(levels, 72, seed) for seed in range(4))
     ]
     ratio = np.sqrt(np.mean(found, axis=0) / levels)
@@ -79,17 +82,21 @@ def test_levels_of_the_truth_are_found(levels: np.ndarray) -> None:
 
 
 def test_an_estimate_knows_nothing_of_later_snapshots() -> None:
-    taken = snapshots(matching.START, 20, 0)
-    states = run(matching.of_loads(NETWORK), taken)
+    taken = snapshots(covariance_matching.START, 20, 0)
+    states = run(covariance_matching.of_loads(NETWORK), taken)
     later = [dataclasses.replace(s, z=1.05 * s.z) if k > 12 else s for k, s in enumerate(taken)]
-    for one, other in zip(states[:13], run(matching.of_loads(NETWORK), later), strict=False):
+    for one, other in zip(
+        states[:13], run(covariance_matching.of_loads(NETWORK), later), strict=False
+    ):
         np.testing.assert_array_equal(one.x, other.x)
         np.testing.assert_array_equal(one.noise.level, other.noise.level)
 
 
 def test_snapshot_moves_only_the_noise_of_the_step_after_it() -> None:
-    taken = snapshots(matching.START, 4, 1)
-    estimator = kalman_filter("kf", NETWORK, metered(), matching.of_loads(NETWORK), step_s=STEP_S)
+    taken = snapshots(covariance_matching.START, 4, 1)
+    estimator = kalman_filter(
+        "kf", NETWORK, metered(), covariance_matching.of_loads(NETWORK), step_s=STEP_S
+    )
     state, _ = estimator.init(taken[0])
     wrong = dataclasses.replace(taken[1], z=1.1 * taken[1].z)
     one, other = (estimator.step(state, s)[0] for s in (taken[1], wrong))
@@ -101,11 +108,13 @@ def test_snapshot_moves_only_the_noise_of_the_step_after_it() -> None:
 
 def test_levels_never_fall_to_zero() -> None:
     """Nothing moves, and the meters say so."""
-    states = run(matching.of_loads(NETWORK), snapshots(np.zeros(3), 40, 2))
+    states = run(covariance_matching.of_loads(NETWORK), snapshots(np.zeros(3), 40, 2))
     for state in states:
-        assert (state.noise.level >= 0.999 * matching.FLOOR * matching.START).all()
+        assert (
+            state.noise.level >= 0.999 * covariance_matching.FLOOR * covariance_matching.START
+        ).all()
         assert np.linalg.eigvalsh(state.P).min() > 0
-    assert (states[-1].noise.level < 0.2 * matching.START).all()
+    assert (states[-1].noise.level < 0.2 * covariance_matching.START).all()
 
 
 def test_levels_of_known_shapes_are_found_from_innovations_alone() -> None:
@@ -115,7 +124,7 @@ def test_levels_of_known_shapes_are_found_from_innovations_alone() -> None:
     half = rng.normal(size=(2, 8, 3))
     D = half @ half.transpose(0, 2, 1)
     root = np.linalg.cholesky(np.eye(8) + np.tensordot(truth, D, 1))
-    made = Matching(lambda _voltage: (), np.ones(2), window=1e9)
+    made = CovarianceMatching(lambda _voltage: (), np.ones(2), window=1e9)
     memory = made.begin()
     for _ in range(draws):
         L = np.linalg.cholesky(np.eye(8) + np.tensordot(memory.level, D, 1))
@@ -129,18 +138,18 @@ def test_levels_of_known_shapes_are_found_from_innovations_alone() -> None:
 
 def test_snapshots_that_tell_nothing_of_any_level_leave_them_near_the_start() -> None:
     # As where every sample is older than the step whose noise is to be told.
-    matching = Matching(lambda _voltage: (), np.array([1e-3, 2e-6]))
+    matching = CovarianceMatching(lambda _voltage: (), np.array([1e-3, 2e-6]))
     memory = matching.begin()
     for _ in range(50):
         memory = matching.learn(memory, np.zeros((2, 3, 3)), np.zeros(3))
-    ratio = memory.level / matching.start
+    ratio = memory.level / covariance_matching.start
     assert ratio[0] == pytest.approx(ratio[1])
     assert 0.1 < ratio[0] < 10.0
 
 
 def test_a_level_that_is_not_seen_keeps_its_scale() -> None:
     """Two shapes, of which the meters see the first only: the other is known by its start alone."""
-    made = Matching(lambda _voltage: (), np.array([1.0, 4.0]))
+    made = CovarianceMatching(lambda _voltage: (), np.array([1.0, 4.0]))
     memory = made.begin()
     rng = np.random.default_rng(SEED)
     for _ in range(100):
@@ -151,7 +160,7 @@ def test_a_level_that_is_not_seen_keeps_its_scale() -> None:
 
 def test_a_level_is_the_mean_of_what_it_may_be() -> None:
     """Beside an integral over the posterior of a level whose best fit lies below zero."""
-    made = Matching(lambda _voltage: (), np.array([0.5]), window=1e9)
+    made = CovarianceMatching(lambda _voltage: (), np.array([0.5]), window=1e9)
     memory = made.begin()
     for _ in range(5):
         memory = made.learn(memory, np.full((1, 1, 1), 0.9), np.array([0.3]))
@@ -179,7 +188,7 @@ def test_a_filter_with_an_estimated_level_covers_the_truth(q: float) -> None:
     rng = np.random.default_rng(SEED)
     inside = []
     for _ in range(20):
-        made = Matching(lambda _voltage: (), np.array([0.01]))
+        made = CovarianceMatching(lambda _voltage: (), np.array([0.01]))
         memory, x, estimate, P = made.begin(), 0.0, 0.0, 1.0
         for k in range(200):
             x += np.sqrt(q) * rng.normal()
@@ -195,13 +204,13 @@ def test_a_filter_with_an_estimated_level_covers_the_truth(q: float) -> None:
 @pytest.mark.parametrize(("start", "window"), [(np.array([0.0, 1.0]), 5), (np.ones(2), 0)])
 def test_impossible_start_is_refused(start: np.ndarray, window: int) -> None:
     with pytest.raises(ParameterError, match="window ≥ 1 and levels above 0"):
-        Matching(lambda _voltage: (), start, window)
+        CovarianceMatching(lambda _voltage: (), start, window)
 
 
 def test_only_the_kalman_filter_estimates_its_noise_from_innovations() -> None:
-    assert Method("kf", "kalman", noise="innovation").noise == "innovation"
+    assert Method.of("kf", "kalman", noise="innovation").noise == "innovation"
     with pytest.raises(ParameterError, match="drop them"):
-        Method("f", "ukf", noise="innovation")
+        Method.of("f", "ukf", noise="innovation")
 
 
 def test_sizes_of_loads_may_come_from_their_meters() -> None:
@@ -212,13 +221,15 @@ def test_sizes_of_loads_may_come_from_their_meters() -> None:
     )
     usual = np.concatenate([NETWORK.p_nominal_pu, NETWORK.q_nominal_pu])
     voltage = np.ones(33, dtype=complex)
-    expected = matching.of_loads(NETWORK).halves(voltage)
-    for half, same in zip(matching.of_loads(bare, usual).halves(voltage), expected, strict=True):
+    expected = covariance_matching.of_loads(NETWORK).halves(voltage)
+    for half, same in zip(
+        covariance_matching.of_loads(bare, usual).halves(voltage), expected, strict=True
+    ):
         np.testing.assert_allclose(half, same)
     # What the tables say counts more than what was read.
     for half, same in zip(
-        matching.of_loads(NETWORK, 2 * usual).halves(voltage), expected, strict=True
+        covariance_matching.of_loads(NETWORK, 2 * usual).halves(voltage), expected, strict=True
     ):
         np.testing.assert_allclose(half, same)
     with pytest.raises(ParameterError, match="how large the loads are"):
-        matching.of_loads(bare)
+        covariance_matching.of_loads(bare)

@@ -7,7 +7,7 @@ import pytest
 from reference import central_differences
 
 from pse_analysis.errors import NotConverged
-from pse_analysis.estimation.process import (
+from pse_analysis.estimation.process.load_noise import (
     LoadStatistics,
     Sensitivity,
     load_noise,

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from qu_bench import Bench, still
 
-from pse_analysis.estimation import robust
-from pse_analysis.estimation.conditioning import Prior
-from pse_analysis.estimation.recovery import Recovery
-from pse_analysis.estimation.robust import Protection
-from pse_analysis.estimation.start import begin
-from pse_analysis.estimation.update import Update, update
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.bad_data import robust
+from pse_analysis.estimation.bad_data.robust import Protection
+from pse_analysis.estimation.filters.conditioning import Prior
+from pse_analysis.estimation.filters.protection import Recovery
+from pse_analysis.estimation.filters.update import Update, update
+from pse_analysis.estimation.static.robust_wls import begin
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.measurement import VA, VM, P, Q
 
 SEED = 5

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import refusal
-from pse_analysis.estimation.refusal import InnovationParams
+from pse_analysis.estimation.bad_data import innovation_test
+from pse_analysis.estimation.bad_data.innovation_test import InnovationTest
 
 SEED = 12
 M = 30
@@ -22,12 +22,12 @@ def innovations(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def found(
-    eta: np.ndarray, S: np.ndarray, sigma: np.ndarray, params: InnovationParams | None = None
+    eta: np.ndarray, S: np.ndarray, sigma: np.ndarray, params: InnovationTest | None = None
 ) -> np.ndarray:
-    return refusal.refuse(params)(eta, np.linalg.cholesky(S), sigma)
+    return innovation_test.refuse(params)(eta, np.linalg.cholesky(S), sigma)
 
 
-def naive(eta: np.ndarray, S: np.ndarray, sigma: np.ndarray, params: InnovationParams) -> list[int]:
+def naive(eta: np.ndarray, S: np.ndarray, sigma: np.ndarray, params: InnovationTest) -> list[int]:
     """The same by inverting what is left, over and over."""
     bound = np.where(
         np.abs(eta) <= params.alone * np.sqrt(np.diagonal(S)), params.certain, params.factor
@@ -35,7 +35,7 @@ def naive(eta: np.ndarray, S: np.ndarray, sigma: np.ndarray, params: InnovationP
     inverse = np.linalg.inv(S)
     if (np.abs(inverse @ eta) / np.sqrt(np.diagonal(inverse)) <= bound).all():
         return []
-    S = np.diag(sigma**2) + params.doubt**2 * (S - np.diag(sigma**2))
+    S = np.diag(sigma**2) + params.forecast_inflation**2 * (S - np.diag(sigma**2))
     left = np.arange(len(eta))
     while len(left) > len(eta) - int(params.largest_share * len(eta)):
         inverse = np.linalg.inv(S[np.ix_(left, left)])
@@ -61,9 +61,10 @@ def test_gross_errors_are_refused_one_by_one_and_nothing_else():
 
 
 @pytest.mark.parametrize(
-    "params", [InnovationParams(), InnovationParams(factor=2.0, doubt=1.0, alone=1.0, certain=5.0)]
+    "params",
+    [InnovationTest(), InnovationTest(factor=2.0, forecast_inflation=1.0, alone=1.0, certain=5.0)],
 )
-def test_refusing_by_ranks_equals_inverting_what_is_left(params: InnovationParams):
+def test_refusing_by_ranks_equals_inverting_what_is_left(params: InnovationTest):
     rng = np.random.default_rng(SEED)
     refused = 0
     for _ in range(50):
@@ -94,7 +95,7 @@ def test_the_one_channel_that_sees_a_step_of_its_load_is_not_refused():
     moved = 8.0 * own
     for covariance, refused in ((with_load, False), (S, True)):
         assert found(moved, covariance, sigma)[7] == refused
-    assert found(moved, with_load, sigma, InnovationParams(doubt=1.0))[7]
+    assert found(moved, with_load, sigma, InnovationTest(forecast_inflation=1.0))[7]
 
 
 def test_what_only_the_others_speak_against_is_refused_where_it_is_certain():
@@ -107,7 +108,7 @@ def test_what_only_the_others_speak_against_is_refused_where_it_is_certain():
         moved = np.zeros(M)
         moved[7] = far * own
         assert 20 < np.abs((inverse @ moved)[7]) / np.sqrt(inverse[7, 7]) < 40
-        assert found(moved, S, sigma, InnovationParams(certain=certain))[7] == refused
+        assert found(moved, S, sigma, InnovationTest(certain=certain))[7] == refused
 
 
 def test_first_refusal_is_the_largest_normalised_residual():
@@ -116,18 +117,19 @@ def test_first_refusal_is_the_largest_normalised_residual():
     inverse = np.linalg.inv(S)
     largest = np.argmax(np.abs(inverse @ eta) / np.sqrt(np.diagonal(inverse)))
     assert largest == 7
-    one = InnovationParams(doubt=1.0, largest_share=0.04)
+    one = InnovationTest(forecast_inflation=1.0, largest_share=0.04)
     np.testing.assert_array_equal(np.flatnonzero(found(eta, S, sigma, one)), [7])
 
 
 def test_more_than_a_share_is_never_refused():
     eta, S, sigma = innovations(np.random.default_rng(SEED))
-    assert found(1e3 * eta, S, sigma, InnovationParams(largest_share=0.2)).sum() <= 6
+    assert found(1e3 * eta, S, sigma, InnovationTest(largest_share=0.2)).sum() <= 6
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"factor": 0.0}, {"certain": 3.0}, {"doubt": 0.5}, {"largest_share": 1.0}]
+    "wrong",
+    [{"factor": 0.0}, {"certain": 3.0}, {"forecast_inflation": 0.5}, {"largest_share": 1.0}],
 )
 def test_impossible_parameters_are_refused(wrong: dict[str, float]):
     with pytest.raises(ParameterError, match="factor ≤ certain"):
-        InnovationParams(**wrong)
+        InnovationTest(**wrong)

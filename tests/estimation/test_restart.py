@@ -11,10 +11,10 @@ from qu_bench import Bench, still
 
 from pse_analysis import parameters
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import Method, Record, build
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.estimator import Estimator, Info, Snapshot
-from pse_analysis.estimation.restart import (
+from pse_analysis.estimation import Method, Record, Setting
+from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.filters.restart import (
     ABSURD,
     Contradiction,
     RestartParams,
@@ -45,7 +45,7 @@ def made(b: Bench, data: dict[str, object]) -> Estimator:
     history = Record(np.zeros(0, "datetime64[us]"), none, none, none, none > 0, none > 0, none)
     whole = {"name": "f", "noise": "scalar", "variance": 1e-8, **data}
     method = parameters.build(Method, whole, "estimate.methods")
-    return build(method, b.network, b.layout, STUDY, history)
+    return method.estimator(Setting(b.network, b.layout, STUDY, history))
 
 
 def spoilt(b: Bench, kind: str) -> tuple[np.ndarray, np.ndarray]:

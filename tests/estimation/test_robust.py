@@ -9,12 +9,12 @@ import pytest
 from qu_bench import Bench, gross_errors, real_day, still
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import robust
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.factors import Root
-from pse_analysis.estimation.gaussian import estimator
-from pse_analysis.estimation.replay import EPOCH, Replay, replay
-from pse_analysis.estimation.robust import MARGIN, Protection, Suspicion, gate
+from pse_analysis.estimation.bad_data import robust
+from pse_analysis.estimation.bad_data.robust import MARGIN, InnovationStats, Protection, gate
+from pse_analysis.estimation.core.cholesky import Root
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.core.run_arrays import EPOCH, ArrayRun, run_arrays
+from pse_analysis.estimation.filters.recursion import estimator
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import VA, VM, MeasurementModel, Q
 from pse_analysis.vocabulary import Reason, Status
@@ -23,7 +23,9 @@ SEED = 30
 TRIALS = 12
 
 
-def suspicion(rng: np.random.Generator, m: int = 12, wrong: tuple[int, ...] = ()) -> Suspicion:
+def suspicion(
+    rng: np.random.Generator, m: int = 12, wrong: tuple[int, ...] = ()
+) -> InnovationStats:
     half = rng.standard_normal((m, 4))
     noise = rng.uniform(0.5, 1.5, m)
     S = half @ half.T + np.diag(noise)
@@ -32,9 +34,11 @@ def suspicion(rng: np.random.Generator, m: int = 12, wrong: tuple[int, ...] = ()
     return of(eta, S, noise)
 
 
-def of(eta: np.ndarray, S: np.ndarray, noise: np.ndarray) -> Suspicion:
+def of(eta: np.ndarray, S: np.ndarray, noise: np.ndarray) -> InnovationStats:
     chol = np.linalg.cholesky(S)
-    return Suspicion(eta, np.diagonal(S).copy(), noise, np.linalg.solve(chol, eta), Root(chol))
+    return InnovationStats(
+        eta, np.diagonal(S).copy(), noise, np.linalg.solve(chol, eta), Root(chol)
+    )
 
 
 def test_gate_lets_good_snapshots_pass_as_often_as_it_says() -> None:
@@ -48,7 +52,7 @@ def test_gate_lets_good_snapshots_pass_as_often_as_it_says() -> None:
 
 
 @pytest.mark.parametrize("judge", robust.JUDGES.values(), ids=robust.JUDGES)
-def test_good_snapshot_is_believed(judge: robust.Judge) -> None:
+def test_good_snapshot_is_believed(judge: robust.GrossErrorTest) -> None:
     found = suspicion(np.random.default_rng(SEED))
     assert found.nis < gate(12)[0]
     assert not judge(found).any()
@@ -256,7 +260,7 @@ def test_unprotected_trace_does_not_come_back_after_a_real_step_of_load() -> Non
     assert np.abs(done.x - b.truth).max(axis=1)[-1] > 0.5 * moved
 
 
-def jump(b: Bench, made: object, at: int = 8) -> Replay:
+def jump(b: Bench, made: object, at: int = 8) -> ArrayRun:
     """All angles jump by up to 0.1 rad at one instant and stay, under next to no process noise."""
     truth = np.repeat(b.truth[:1], 21, axis=0)
     truth[at:, : b.network.n_bus] += 0.1 * np.linspace(0.5, 1.0, b.network.n_bus)
@@ -292,7 +296,7 @@ def test_forecast_is_widened_where_a_snapshot_alone_is_not_enough() -> None:
     z = made.model.h(truth.T).T
     z += b.layout.sigma * np.random.default_rng(SEED).standard_normal(z.shape)
     known = np.broadcast_to(seen, z.shape)
-    done = replay(made, truth[0], b.start, z, b.layout.sigma, available=known)
+    done = run_arrays(made, truth[0], b.start, z, b.layout.sigma, available=known)
     told = [i.detail for i in done.info if i.status is Status.RESTARTED]
     assert "the forecast was widened" in told[0]
     assert np.abs(done.x[-1] - truth[-1])[: b.network.n_bus].max() < 0.05
@@ -307,7 +311,7 @@ def test_movement_that_many_channels_see_is_no_error() -> None:
     z = made.model.h(truth.T).T
     z += b.layout.sigma * np.random.default_rng(SEED).standard_normal(z.shape)
     angles = b.layout.quantity == VA
-    done = replay(made, truth[0], 1e-5 * np.eye(len(b.start)), z, b.layout.sigma)
+    done = run_arrays(made, truth[0], 1e-5 * np.eye(len(b.start)), z, b.layout.sigma)
     last = done.info[-1]
     assert (np.abs(last.innovation[angles]) > 3.0 * last.sigma_innovation[angles]).all()
     assert not last.inflation.any()

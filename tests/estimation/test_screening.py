@@ -43,7 +43,7 @@ def telemetry(spiked: bool):
 def estimated(screen: str, *, spiked: bool, reading: str = "instant"):
     raw, aligned = telemetry(spiked)
     # Two hours of history teach no load noise.
-    method = Method(
+    method = Method.of(
         "m",
         "kalman",
         noise="scalar",
@@ -84,7 +84,7 @@ def test_a_bad_sample_costs_a_screened_filter_what_a_missing_one_costs():
     raw, aligned = telemetry(True)
     times = np.sort(aligned["time_utc"][aligned["time_utc"] >= STUDY.start].unique())[SPIKED]
     gone = (aligned["channel"] == "pmu:bus/6:vm_pu") & aligned["time_utc"].isin(times)
-    plain = Method("m", "kalman", noise="scalar", variance=1e-5, reading="instant")
+    plain = Method.of("m", "kalman", noise="scalar", variance=1e-5, reading="instant")
     without = estimate(aligned[~gone], raw.channels, feeder(), STUDY, plain)
     screened, _ = estimated("scaled", spiked=True)
     apart = screened.estimated["value"] - without.estimated["value"]
@@ -101,11 +101,13 @@ def test_without_bad_data_the_innovation_screening_refuses_next_to_nothing():
 
 def test_an_adaptive_threshold_stands_before_any_estimator():
     raw, aligned = telemetry(True)
-    done = estimate(aligned, raw.channels, feeder(), STUDY, Method("m", "wls", screening="scaled"))
+    done = estimate(
+        aligned, raw.channels, feeder(), STUDY, Method.of("m", "wls", screening="scaled")
+    )
     found = spiked_rows(done.residuals)["reasons"] & int(Reason.INCREMENT)
     assert (found > 0).all()
 
 
 def test_screening_by_innovation_is_for_the_kalman_filter():
     with pytest.raises(ParameterError, match="kalman"):
-        Method("m", "wls", screening="innovation")
+        Method.of("m", "wls", screening="innovation")

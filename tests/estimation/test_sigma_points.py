@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from reference import every_quantity
 
-from pse_analysis.estimation.conditioning import Prior
-from pse_analysis.estimation.sigma_points import SigmaPoints
+from pse_analysis.estimation.filters.conditioning import Prior
+from pse_analysis.estimation.filters.sigma_points import SigmaPoints
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import IA, IM, MeasurementModel, wrap

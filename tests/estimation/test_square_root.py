@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from qu_bench import VARIANCE, Bench, still
 
-from pse_analysis.estimation.conditioning import Moments, Prior
-from pse_analysis.estimation.replay import EPOCH
-from pse_analysis.estimation.square_root import Halves, carried
-from pse_analysis.estimation.unscented import Form, Scaling
+from pse_analysis.estimation.core.run_arrays import EPOCH
+from pse_analysis.estimation.filters.conditioning import Moments, Prior
+from pse_analysis.estimation.filters.square_root import Halves, carried
+from pse_analysis.estimation.filters.unscented import Form, Scaling
 from pse_analysis.measurement import VM
 from pse_analysis.vocabulary import Status
 

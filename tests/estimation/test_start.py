@@ -9,12 +9,12 @@ import pytest
 from qu_bench import Bench, gross_errors, still
 
 from pse_analysis.errors import Unobservable
-from pse_analysis.estimation.composition import Composition, build, scalar
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.kalman import kalman_filter
-from pse_analysis.estimation.process import scalar_noise
-from pse_analysis.estimation.start import begin, robust_wls
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.filters.composition import Composition, build, scalar
+from pse_analysis.estimation.filters.kalman import kalman_filter
+from pse_analysis.estimation.process.load_noise import scalar_noise
+from pse_analysis.estimation.static.robust_wls import begin, robust_wls
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.measurement import VM, P, Q
 from pse_analysis.vocabulary import Reason, Status
 

@@ -9,13 +9,15 @@ import pytest
 from qu_bench import VARIANCE, Bench, real_day, still
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import factors, gaussian, holt, noise, unscented
-from pse_analysis.estimation.composition import Composition, build, scalar
-from pse_analysis.estimation.conditioning import Prior
-from pse_analysis.estimation.driver import run
-from pse_analysis.estimation.noise import Learnt, sage_husa
-from pse_analysis.estimation.replay import EPOCH, replay
-from pse_analysis.estimation.unscented import Scaling
+from pse_analysis.estimation.core import cholesky
+from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.core.run_arrays import EPOCH, run_arrays
+from pse_analysis.estimation.filters import recursion, unscented
+from pse_analysis.estimation.filters.composition import Composition, build, scalar
+from pse_analysis.estimation.filters.conditioning import Prior
+from pse_analysis.estimation.filters.unscented import Scaling
+from pse_analysis.estimation.process import dynamics, sage_husa
+from pse_analysis.estimation.process.sage_husa import Learnt
 from pse_analysis.measurement import IA, IM, VA, VM, MeasurementModel, P, SensorLayout
 from pse_analysis.vocabulary import Status
 
@@ -56,7 +58,7 @@ def test_moments_equal_the_weighted_sums(order: int, alpha: float, beta: float) 
     apart = y - mean[:, None]
     np.testing.assert_allclose(found.mean, mean, atol=1e-10)
     own = (weight * apart) @ apart.T
-    np.testing.assert_allclose(factors.symmetric(found.own), own, atol=1e-10)
+    np.testing.assert_allclose(cholesky.symmetric(found.own), own, atol=1e-10)
     cross = (weight * (points - prior.s[:, None])) @ apart.T
     np.testing.assert_allclose(found.cross, cross, atol=1e-10)
 
@@ -66,7 +68,7 @@ def test_rows_that_are_not_available_count_for_nothing() -> None:
     rng = np.random.default_rng(SEED)
     z = b.measure(rng)
     known = rng.random(z.shape) < 0.8
-    whole = replay(
+    whole = run_arrays(
         b.filter(), b.truth[0], b.start, np.where(known, z, 1e6), b.layout.sigma, available=known
     )
     state = b.filter().begin(b.truth[0], b.start, EPOCH)
@@ -137,14 +139,14 @@ def test_alpha_on_ieee30_settles_as_published() -> None:
     angle = np.where(size < 0.02, 0.002, 0.02)
     model = MeasurementModel(b.network, b.layout)
     variance = np.concatenate([angle, size]) ** 2
-    made = gaussian.GaussianFilter(
+    made = recursion.GaussianFilter(
         model,
-        holt.holt(),
+        dynamics.holt(),
         unscented.by_moments(model),
-        noise.known(noise.constant(variance), holt.holt()),
+        sage_husa.known(sage_husa.constant(variance), dynamics.holt()),
     )
     z = b.measure(np.random.default_rng(SEED))[:30]
-    alpha = replay(made, b.truth[0], np.diag(variance), z, b.layout.sigma).tuned
+    alpha = run_arrays(made, b.truth[0], np.diag(variance), z, b.layout.sigma).alpha
     np.testing.assert_allclose(alpha[:3], [0.309, 0.301, 0.303], atol=1e-3)
     assert np.ptp(alpha[3:]) < 1e-3
 
@@ -173,11 +175,11 @@ def test_alpha_by_likelihood_is_the_likeliest() -> None:
         found = unscented.fixed(model, Scaling(alpha)).predict(
             prior, snapshot, rows, alpha, prior.s
         )
-        S = factors.symmetric(found.own) + np.diag(snapshot.sigma**2)
+        S = cholesky.symmetric(found.own) + np.diag(snapshot.sigma**2)
         eta = snapshot.z - found.mean
         return float(-eta @ np.linalg.solve(S, eta) - np.linalg.slogdet(S)[1])
 
-    best = unscented.by_likelihood(model).predict(prior, snapshot, rows, 1.0, prior.s).tuned
+    best = unscented.by_likelihood(model).predict(prior, snapshot, rows, 1.0, prior.s).alpha
     grid = np.linspace(*unscented.ALPHA_RANGE, 50)
     assert log_likelihood(best) >= max(map(log_likelihood, grid)) - 1e-3
 
@@ -216,8 +218,8 @@ def test_iterated_filter_stops_where_its_estimate_does() -> None:
 
 def test_sage_husa_is_its_recursion_and_falls_back_to_a_positive_form() -> None:
     rng = np.random.default_rng(SEED)
-    process = holt.random_walk()
-    made = sage_husa(noise.constant(np.full(3, 0.1)), process, forgetting=0.95)
+    process = dynamics.random_walk()
+    made = sage_husa.sage_husa(sage_husa.constant(np.full(3, 0.1)), process, forgetting=0.95)
     memory = made.begin(np.zeros(6), EPOCH)
     moved, correction = rng.standard_normal((2, 3))
     share = (1 - 0.95) / (1 - 0.95**2)
@@ -231,7 +233,7 @@ def test_sage_husa_is_its_recursion_and_falls_back_to_a_positive_form() -> None:
     biased = (1 - share) * 0.1 * np.eye(3) + share * np.outer(correction, correction)
     np.testing.assert_allclose(shrunk.covariance, biased)
     with pytest.raises(ParameterError, match="0 < forgetting < 1"):
-        sage_husa(noise.constant(np.ones(3)), process, forgetting=1.0)
+        sage_husa.sage_husa(sage_husa.constant(np.ones(3)), process, forgetting=1.0)
 
 
 def test_sage_husa_learns_the_noise_of_its_own_model() -> None:

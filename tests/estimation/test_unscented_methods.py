@@ -12,9 +12,9 @@ from qu_bench import still
 
 from pse_analysis import parameters
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import EstimateParams, Method, Record, build
-from pse_analysis.estimation.composition import Composition
-from pse_analysis.estimation.estimator import Estimator
+from pse_analysis.estimation import EstimateParams, Method, Record, Setting
+from pse_analysis.estimation.core.interface import Estimator
+from pse_analysis.estimation.filters.composition import Composition
 from pse_analysis.parameters import Study
 
 CASES = Path(__file__).parents[2] / "pipelines" / "cases"
@@ -27,7 +27,7 @@ def made(method: Method) -> Estimator:
     b = still("ieee14")
     none = np.zeros((0, len(b.layout)))
     history = Record(np.zeros(0, "datetime64[us]"), none, none, none, none > 0, none > 0, none)
-    return build(method, b.network, b.layout, STUDY, history)
+    return method.estimator(Setting(b.network, b.layout, STUDY, history))
 
 
 @pytest.mark.parametrize("case", ["ieee30", "ieee118"])
@@ -49,7 +49,7 @@ def test_methods_of_the_cases_track_the_state(case: str) -> None:
 
 def test_scalar_noise_is_added_to_every_voltage() -> None:
     b = still("ieee14")
-    estimator = made(Method("f", "ekf", noise="scalar", variance=1e-3))
+    estimator = made(Method.of("f", "ekf", noise="scalar", variance=1e-3))
     state, _ = estimator.init(b.snapshot(b.exact[0]))
     nothing = np.zeros(len(b.layout), dtype=bool)
     after, _ = estimator.step(state, b.snapshot(b.exact[0], nothing))
@@ -58,7 +58,7 @@ def test_scalar_noise_is_added_to_every_voltage() -> None:
 
 def test_load_noise_moves_what_the_loads_move_and_not_the_reference() -> None:
     b = still("ieee14")
-    estimator = made(Method("f", "ukf", noise="load", source_sigma=1e-3))
+    estimator = made(Method.of("f", "ukf", noise="load", source_sigma=1e-3))
     state, _ = estimator.init(b.snapshot(b.exact[0]))
     nothing = np.zeros(len(b.layout), dtype=bool)
     after, _ = estimator.step(state, b.snapshot(b.exact[0], nothing))
@@ -73,7 +73,7 @@ def test_composition_belongs_to_the_filters_that_have_one() -> None:
     with pytest.raises(
         ParameterError, match=r"compose = \{ … \} is for ukf and ekf, .*the filter is kalman"
     ):
-        Method("f", "kalman", compose=Composition(process="holt", robustness="trace"))
+        Method.of("f", "kalman", compose=Composition(process="holt", robustness="trace"))
     with pytest.raises(ParameterError, match="trace"):
         parameters.build(
             Method, {"name": "f", "filter": "ukf", "compose": {"robustness": "tracer"}}, "m"

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from reference import GRIDS, every_quantity, measured
 
 from pse_analysis.errors import Unobservable
-from pse_analysis.estimation.estimator import Snapshot
-from pse_analysis.estimation.tracking import tracking_wls
-from pse_analysis.estimation.wls import WeightedLeastSquares
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.static.tracking import tracking_wls
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve

@@ -8,10 +8,15 @@ import pytest
 from qu_bench import still
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.composition import Composition
-from pse_analysis.estimation.process import LoadStatistics
+from pse_analysis.estimation.filters.composition import Composition
+from pse_analysis.estimation.process.load_noise import LoadStatistics
 from pse_analysis.measurement import VM
-from pse_analysis.pipeline.replays import Errors, Experiment, Recipe, replays
+from pse_analysis.pipeline.monte_carlo_filters import (
+    Errors,
+    Experiment,
+    Recipe,
+    monte_carlo_filters,
+)
 
 SEEDS = (3, 4, 5)
 PLAIN = Recipe(Composition())
@@ -28,7 +33,7 @@ def test_numbers_do_not_depend_on_the_number_of_processes() -> None:
         "clean": experiment(ukf=PLAIN, robust=ROBUST),
         "bad": experiment(Errors(0.05), ukf=PLAIN, robust=ROBUST),
     }
-    alone, two = (replays(tried, SEEDS, workers=n) for n in (1, 2))
+    alone, two = (monte_carlo_filters(tried, SEEDS, workers=n) for n in (1, 2))
     # The workers have one BLAS thread; this process has as many as it was given.
     pd.testing.assert_frame_equal(alone, two, rtol=1e-9)
     assert list(alone.columns[:3]) == ["experiment", "filter", "seed"]
@@ -37,7 +42,7 @@ def test_numbers_do_not_depend_on_the_number_of_processes() -> None:
 
 def test_experiments_share_the_noise_of_a_seed_and_seeds_do_not() -> None:
     tried = {"a": experiment(), "b": experiment(Errors(1.0, 100.0, 9, "vm_pu@bus/4"))}
-    table = replays(tried, SEEDS, workers=1).set_index(["experiment", "seed"])
+    table = monte_carlo_filters(tried, SEEDS, workers=1).set_index(["experiment", "seed"])
     assert table.loc["a", "vm_rmse"].is_unique
     assert (table.loc["b", "vm_rmse"] > 5.0 * table.loc["a", "vm_rmse"]).all()
     noise = [tried[name].measured(3)[0][:9] for name in tried]
@@ -46,7 +51,7 @@ def test_experiments_share_the_noise_of_a_seed_and_seeds_do_not() -> None:
 
 def test_named_channels_are_counted_against_what_was_spoilt() -> None:
     errors = Errors(1.0, 10.0, 9, "vm_pu@bus/4")
-    table = replays({"one": experiment(errors, robust=ROBUST)}, SEEDS, workers=1)
+    table = monte_carlo_filters({"one": experiment(errors, robust=ROBUST)}, SEEDS, workers=1)
     for column in ("bad", "named", "right", "large", "found"):
         assert list(table[column]) == [1, 1, 1]
     assert not table["lost"].any()
@@ -61,7 +66,9 @@ def test_noise_learnt_from_loads_can_be_a_recipe() -> None:
     b = still("ieee14")
     n = 2 * b.network.n_bus
     known = LoadStatistics(np.full((1, n), 0.01), np.eye(n), 1e-3, 86400.0)
-    table = replays({"clean": experiment(load=Recipe(Composition(), known))}, SEEDS, workers=1)
+    table = monte_carlo_filters(
+        {"clean": experiment(load=Recipe(Composition(), known))}, SEEDS, workers=1
+    )
     assert (table["vm_rmse"] < 0.01).all()
 
 

@@ -118,8 +118,8 @@ def check_case(case: Case) -> Parameters:
 def _check_filters(estimate: EstimateParams, about_machine: bool) -> None:
     """Refuse a machine's method for a grid, and the reverse."""
     for method in estimate.methods:
-        if (method.filter == "observer") != about_machine:
-            right = "observer" if about_machine else "wls, kalman, ukf or ekf"
+        if (method.about == "machine") != about_machine:
+            right = '"observer"' if about_machine else "wls, kalman, ukf or ekf"
             raise ParameterError(
                 f"[estimate.methods] {method.name!r}: filter = {method.filter!r}, but the case is "
                 f"about a {'machine' if about_machine else 'grid'}: use {right}"

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pse_analysis.estimation import Method
+from pse_analysis.estimation import Method, Observer
 from pse_analysis.estimation.machine import continuous_gain, rms
 from pse_analysis.machine import STATES, Densities, Machine
 
@@ -64,7 +64,7 @@ def expect(
             rms(machine, m.observer.tuning, densities, step_s),
         )
         for m in methods
-        if m.observer is not None
+        if isinstance(m, Observer)
     }
 
 

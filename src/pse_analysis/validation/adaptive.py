@@ -189,7 +189,7 @@ def step(
     turn: FloatArray | float = np.inf,
     kind: IntArray | None = None,
 ) -> tuple[AdaptiveState, Decision]:
-    """Judge one sample of each channel.
+    """GrossErrorTest one sample of each channel.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def screen(
     turn: FloatArray | float = np.inf,
     kind: IntArray | None = None,
 ) -> Decision:
-    """Judge whole records, sample by sample.
+    """GrossErrorTest whole records, sample by sample.
 
     Parameters
     ----------

@@ -11,9 +11,7 @@ from pse_analysis.estimation.machine.gain import (
     require_solvable,
 )
 from pse_analysis.estimation.machine.observer import ObserverState, observe, observer
-from pse_analysis.estimation.machine.study import ObserverParams, from_params, snapshots
-from pse_analysis.estimation.machine.trials import Simulated, simulated_rms
-from pse_analysis.estimation.machine.tuning import (
+from pse_analysis.estimation.machine.stationary_error import (
     ModelError,
     Tuned,
     continuous_covariance,
@@ -22,6 +20,8 @@ from pse_analysis.estimation.machine.tuning import (
     rms,
     tune,
 )
+from pse_analysis.estimation.machine.study import ObserverParams, from_params, snapshots
+from pse_analysis.estimation.machine.trials import Simulated, simulated_rms
 
 __all__ = [
     "Finding",

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation.estimator import Estimate, Estimator, Info, Snapshot
+from pse_analysis.estimation.core.interface import Estimate, Estimator, Info, Snapshot
 from pse_analysis.estimation.machine.gain import Poles, Tuning, discrete_gain, filter_gain
 from pse_analysis.machine import Densities, Machine, sample
 from pse_analysis.vocabulary import Status

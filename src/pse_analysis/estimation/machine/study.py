@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation.estimator import Estimator, Snapshot
+from pse_analysis.estimation.core.interface import Estimator, Snapshot
+from pse_analysis.estimation.core.snapshots import Record
 from pse_analysis.estimation.machine.gain import Poles, Tuning
 from pse_analysis.estimation.machine.observer import NEEDS_INPUT, observer
-from pse_analysis.estimation.records import Record
 from pse_analysis.machine import Densities, Machine
 from pse_analysis.measurement import DELTA_M, ROTOR_ANGLE, SensorLayout
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from pse_analysis.estimation.machine.gain import Tuning, discrete_gain
 from pse_analysis.estimation.machine.observer import observe
-from pse_analysis.estimation.machine.tuning import discrete_covariance
+from pse_analysis.estimation.machine.stationary_error import discrete_covariance
 from pse_analysis.machine import Densities, Machine
 from pse_analysis.simulation.machine import disturb
 

@@ -1,0 +1,1 @@
+"""Tests for gross errors: of residuals, of innovations, of a channel alone."""

@@ -1,0 +1,1 @@
+"""What every estimator shares: its shape, snapshots, the run over them, triangular algebra."""

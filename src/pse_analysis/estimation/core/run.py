@@ -1,0 +1,267 @@
+"""Runs an estimator over the snapshots of a case, and writes down what it said and did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from pse_analysis.errors import NotConverged, Unobservable
+from pse_analysis.estimation.core.interface import FAILURES, Estimate, Estimator, Info, Snapshot
+from pse_analysis.machine import STATES, Machine
+from pse_analysis.measurement import Model, SensorLayout, wrap
+from pse_analysis.vocabulary import Status
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+CONSISTENCY_STEPS = 12
+"""Steps over which NIS is summed before a filter is called inconsistent."""
+CONSISTENCY_RATIO = (0.5, 2.0)
+"""NIS/m beyond which a filter is called inconsistent, if the χ² bounds are left as well.
+
+Real load is heavy-tailed and its volatility changes with the hour, so that the χ² bounds alone,
+which are right for a filter's own model, would condemn every filter.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """What the entries of a model's estimate are called in tables.
+
+    Attributes
+    ----------
+    element, quantity : (n,) ndarray of str
+    factor : (n,) ndarray
+        Reported value over the estimate's own.
+    folded : (n,) ndarray of bool
+        Angles that are known up to full turns.
+    """
+
+    element: npt.NDArray[np.object_]
+    quantity: npt.NDArray[np.object_]
+    factor: FloatArray
+    folded: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.factor)
+
+    @classmethod
+    def of(cls, model: Model) -> States:
+        """States of a grid or a machine."""
+        if isinstance(model, Machine):
+            return cls(
+                np.array([model.element] * len(STATES), dtype=object),
+                np.array(STATES, dtype=object),
+                np.ones(len(STATES)),
+                np.zeros(len(STATES), dtype=bool),
+            )
+        n = model.n_bus
+        return cls(
+            np.array([f"bus/{name}" for name in model.buses.name] * 2, dtype=object),
+            np.array(["va_degree"] * n + ["vm_pu"] * n, dtype=object),
+            np.concatenate([np.full(n, 180.0 / np.pi), np.ones(n)]),
+            np.arange(2 * n) < n,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Tables of one method on one trial; the schemas of the same names say what they hold."""
+
+    estimated: pd.DataFrame
+    residuals: pd.DataFrame
+    steps: pd.DataFrame
+
+
+@dataclass
+class _Trace:
+    """What the driver collects per step, before it becomes tables."""
+
+    time: list[np.datetime64] = field(default_factory=list)
+    x: list[FloatArray] = field(default_factory=list)
+    sigma: list[FloatArray] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    info: list[Info] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+
+def run(
+    estimator: Estimator,
+    snapshots: Iterator[Snapshot],
+    model: Model,
+    layout: SensorLayout,
+    *,
+    trial: int = 0,
+    truth: FloatArray | None = None,
+) -> Estimated:
+    """Run an estimator over snapshots; no snapshot stops the run.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    snapshots : iterator of Snapshot
+    model : Network or Machine
+    layout : SensorLayout
+    trial : int
+    truth : (T, n) ndarray, optional
+        True states at the instants, for NEES: [θ; |V|] [rad, p.u.], or [θ; ω] [rad, rad/s].
+
+    Returns
+    -------
+    Estimated
+    """
+    trace = _Trace()
+    state: Any = None
+    states = States.of(model)
+    nothing = np.full(len(states), np.nan)
+    for k, snapshot in enumerate(snapshots):
+        begun = time.perf_counter()
+        state, info, estimate = _outlived(estimator, state, snapshot, len(layout))
+        seconds = time.perf_counter() - begun
+        if estimate is not None and not (
+            np.isfinite(estimate.x).all() and np.isfinite(np.diagonal(estimate.covariance)).all()
+        ):
+            estimate, state = None, None
+            info = Info.nothing(
+                len(layout), Status.DIVERGED, "the state is not finite: it restarts next instant"
+            )
+        trace.time.append(snapshot.time)
+        trace.info.append(info)
+        trace.seconds.append(seconds)
+        trace.x.append(nothing if estimate is None else estimate.x)
+        trace.sigma.append(
+            nothing
+            if estimate is None
+            else np.sqrt(np.maximum(np.diagonal(estimate.covariance), 0.0))
+        )
+        reference = None if truth is None else truth[k]
+        trace.nees.append(_nees(estimate, reference, states.folded))
+    return _tables(estimator.name, trial, trace, states, layout)
+
+
+def _outlived(
+    estimator: Estimator, state: Any, snapshot: Snapshot, m: int
+) -> tuple[Any, Info, Estimate | None]:
+    """A step and its estimate; none of both where the numbers of the snapshot do not allow it."""
+    try:
+        # A state that leaves the range of numbers is told by its status.
+        with np.errstate(all="ignore"):
+            state, info = (
+                estimator.init(snapshot) if state is None else estimator.step(state, snapshot)
+            )
+            return state, info, None if state is None else estimator.read(state)
+    except FAILURES as error:
+        if isinstance(error, Unobservable | NotConverged):
+            unobservable = isinstance(error, Unobservable)
+            status = Status.UNOBSERVABLE if unobservable else Status.NOT_CONVERGED
+            return None, Info.nothing(m, status, str(error)), None
+        why = f"{type(error).__name__}: {error}: it restarts next instant"
+        return None, Info.nothing(m, Status.DIVERGED, why), None
+
+
+def _nees(estimate: Estimate | None, truth: FloatArray | None, folded: BoolArray) -> float:
+    if estimate is None or truth is None or not np.isfinite(truth).all():
+        return float("nan")
+    error = estimate.x - truth
+    error[folded] = wrap(error[folded])
+    deviation = np.sqrt(np.diagonal(estimate.covariance))
+    free = deviation > 1e-12
+    scaled = estimate.covariance[np.ix_(free, free)] / np.outer(deviation[free], deviation[free])
+    try:
+        factor = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return float("nan")
+    white = np.linalg.solve(factor, error[free] / deviation[free])
+    return float(white @ white)
+
+
+def _consistent(nis: FloatArray, dof: npt.NDArray[np.int64]) -> BoolArray:
+    """Whether NIS of the last steps stays inside its bounds, at every step.
+
+    At the start there are fewer; the first alone is as much as a single snapshot has to show.
+    """
+    known = np.isfinite(nis) & (dof > 0)
+    total, freedom = (
+        pd.Series(np.where(known, part, 0.0))
+        .rolling(CONSISTENCY_STEPS, min_periods=1)
+        .sum()
+        .to_numpy()
+        for part in (nis, dof)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        low, high = stats.chi2.ppf([[0.0005], [0.9995]], freedom)
+        ratio = total / freedom
+        wide = (ratio >= CONSISTENCY_RATIO[0]) & (ratio <= CONSISTENCY_RATIO[1])
+    judged = np.isfinite(total) & (freedom > 0)
+    return np.asarray(~judged | wide | ((total >= low) & (total <= high)))
+
+
+def _tables(
+    method: str, trial: int, trace: _Trace, states: States, layout: SensorLayout
+) -> Estimated:
+    times = pd.DatetimeIndex(np.asarray(trace.time, dtype="datetime64[us]"), tz="UTC")
+    count, n = len(times), len(states)
+    nis = np.array([i.nis for i in trace.info])
+    dof = np.array([i.dof for i in trace.info], dtype=np.int64)
+    status = [
+        Status.INCONSISTENT if i.status is Status.OK and not good else i.status
+        for i, good in zip(trace.info, _consistent(nis, dof), strict=True)
+    ]
+    used = np.array([i.used for i in trace.info]).reshape(count, len(layout))
+    steps = pd.DataFrame(
+        {
+            "method": method,
+            "trial": np.int32(trial),
+            "time_utc": times,
+            "status": [str(s) for s in status],
+            "iterations": np.array([i.iterations for i in trace.info], dtype=np.int32),
+            "nis": nis,
+            "nees": np.array(trace.nees),
+            "dof": dof.astype(np.int32),
+            "rejected": np.array(
+                [int((i.judged & ((i.inflation > 0) | ~i.used)).sum()) for i in trace.info],
+                dtype=np.int32,
+            ),
+            "seconds": np.array(trace.seconds),
+            "detail": [i.detail for i in trace.info],
+        }
+    )
+    x, sigma = np.array(trace.x).reshape(count, n), np.array(trace.sigma).reshape(count, n)
+    estimated = pd.DataFrame(
+        {
+            "method": method,
+            "trial": np.int32(trial),
+            "time_utc": times.repeat(n),
+            "element": np.tile(states.element, count),
+            "quantity": np.tile(states.quantity, count),
+            "value": (x * states.factor).ravel(),
+            "sigma": (sigma * states.factor).ravel(),
+        }
+    )
+    judged = np.array([i.judged for i in trace.info]).reshape(count, len(layout))
+    at, row = np.nonzero(judged)
+    innovation, deviation, inflation, findings = (
+        np.array([getattr(i, name) for i in trace.info]).reshape(count, len(layout))[at, row]
+        for name in ("innovation", "sigma_innovation", "inflation", "findings")
+    )
+    residuals = pd.DataFrame(
+        {
+            "method": method,
+            "trial": np.int32(trial),
+            "time_utc": times[at],
+            "channel": np.asarray(layout.channel, dtype=object)[row],
+            "innovation": innovation,
+            "sigma_innovation": deviation,
+            "inflation": inflation,
+            "used": used[at, row],
+            "reasons": findings.astype(np.int32),
+        }
+    )
+    return Estimated(estimated, residuals, steps)

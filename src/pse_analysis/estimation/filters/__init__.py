@@ -1,0 +1,1 @@
+"""The recursion of a filter, and the ways to predict measurements."""

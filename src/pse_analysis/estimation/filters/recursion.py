@@ -1,0 +1,263 @@
+"""The recursion that the unscented and the extended filter share.
+
+Predict with an affine process, predict the measurements in whichever way (`Observe`), judge the
+innovation, condition. What is composed: process × observation × noise × robustness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pse_analysis.estimation.bad_data import robust
+from pse_analysis.estimation.bad_data.robust import GrossErrorTest, Protection
+from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.filters.conditioning import Prior
+from pse_analysis.estimation.filters.protection import Recovery
+from pse_analysis.estimation.filters.restart import WIDER
+from pse_analysis.estimation.filters.square_root import carried
+from pse_analysis.estimation.filters.update import Observation, Update, update
+from pse_analysis.estimation.process.dynamics import Process
+from pse_analysis.estimation.process.sage_husa import Learnt, Noise
+from pse_analysis.estimation.static.robust_wls import begin
+from pse_analysis.estimation.static.wls import WeightedLeastSquares
+from pse_analysis.grid.network import Network
+from pse_analysis.measurement import VA, VM, MeasurementModel, SensorLayout
+from pse_analysis.vocabulary import Status
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """How gross errors are met.
+
+    Attributes
+    ----------
+    judge : GrossErrorTest
+    protection : Protection, optional
+        Against latching; None to go without.
+    """
+
+    judge: GrossErrorTest = robust.none
+    protection: Protection | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianState:
+    """State of a filter between two instants.
+
+    Attributes
+    ----------
+    s : (N,) ndarray
+        Estimated entries of [θ; |V|], and their slopes if the process has any. [rad, p.u.]
+    P : (N, N) ndarray
+        Its covariance.
+    x : (2N_bus,) ndarray
+        [θ; |V|].
+    process, noise : object
+        Memories of these parts.
+    alpha : float
+        Memory of the observation.
+    refusals : (m,) ndarray of int
+        Consecutive refusals of each channel.
+    snapshot_rejections : int
+        Consecutive snapshots that were refused as a whole.
+    chol_P : (N, N) ndarray, optional
+        Root of P, where it is carried beside it.
+    """
+
+    s: FloatArray
+    P: FloatArray
+    x: FloatArray
+    process: Any
+    noise: Any
+    alpha: float
+    refusals: IntArray
+    snapshot_rejections: int = 0
+    chol_P: FloatArray | None = None
+
+
+class GaussianFilter:
+    """A filter for one sensor layout.
+
+    Parameters
+    ----------
+    model : MeasurementModel
+        Its columns are the voltages to be estimated.
+    process : Process
+    observation : Observation
+    noise : Noise
+    robustness : Robustness
+    """
+
+    def __init__(
+        self,
+        model: MeasurementModel,
+        process: Process,
+        observation: Observation,
+        noise: Noise,
+        robustness: Robustness | None = None,
+    ) -> None:
+        self.model = model
+        self.process = process
+        self.observation = observation
+        self.noise = noise
+        self.robustness = robustness or Robustness()
+        # Voltages come first: what is linear in the state needs no inverse to be judged.
+        voltage = np.isin(model.layout.quantity, (VM, VA))
+        self._order = np.concatenate([np.flatnonzero(voltage), np.flatnonzero(~voltage)])
+        protection = self.robustness.protection
+        self._recovery = None if protection is None else Recovery(model, protection)
+
+    def begin(self, x: FloatArray, P: FloatArray, time: np.datetime64) -> GaussianState:
+        """State from an estimate of [θ; |V|] (2N,) with covariance P (n, n) of the columns."""
+        s, covariance, memory = self.process.begin(
+            x[self.model.columns], P, self.noise.voltages(x, time)
+        )
+        return GaussianState(
+            s,
+            covariance,
+            x,
+            memory,
+            self.noise.begin(x, time),
+            self.observation.alpha,
+            np.zeros(self.model.shape[0], dtype=np.int64),
+        )
+
+    def step(self, state: GaussianState, snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
+        """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
+        m = self.model.shape[0]
+        s, forecast, process = self.process.forecast(state.s, state.P, state.process)
+        columns = self.model.columns
+        ahead = state.x.copy()
+        ahead[columns] = s[: len(columns)]
+        drift, covariance, noise = self.noise.current(state.noise, ahead, snapshot.time)
+        affine = s
+        s = s + drift
+        x = state.x.copy()
+        x[columns] = s[: len(columns)]
+        root = state.chol_P
+        if root is not None:
+            root = carried(_through(self.process.transition, root), covariance)
+        prior = Prior(s, forecast + covariance, x, columns, root)
+        used = snapshot.available & snapshot.fresh
+        if not used.any():
+            return replace(state, s=s, P=prior.P, x=x, process=process, chol_P=root), Info.nothing(
+                m, Status.PREDICTED
+            )
+        rows = self._order[used[self._order]]
+        judge, status, detail = self.robustness.judge, Status.OK, ""
+        if (
+            self._recovery is not None
+            and state.snapshot_rejections >= self._recovery.protection.patience - 1
+        ):
+            judge = robust.per_channel
+            detail = "snapshots were refused as a whole before: each channel is judged by itself"
+        try:
+            done = update(self.model, self.observation, prior, snapshot, rows, state.alpha, judge)
+            refusals, snapshot_rejections = self._refused(state, done, rows, judge)
+            if self._recovery is not None and self._recovery.protection.latched(refusals, used):
+                restart, detail = self._recovery.find(prior, snapshot, rows, done, refusals[rows])
+                if restart is not None:
+                    again = self.begin(restart.x, restart.P, snapshot.time)
+                    # What was learnt about the noise is kept.
+                    again = replace(
+                        again,
+                        noise=state.noise,
+                        alpha=done.alpha,
+                        snapshot_rejections=snapshot_rejections,
+                    )
+                    return again, restart.told.info(Status.RESTARTED, snapshot, rows, detail)
+                # Wrong meters stay wrong whatever the forecast says; ask again after a while.
+                refusals[:] = 0
+        except np.linalg.LinAlgError as error:
+            return None, Info.nothing(
+                m, Status.DIVERGED, f"{error}: the filter starts again from least squares"
+            )
+        if not done.converged:
+            status = Status.NOT_CONVERGED
+            detail = f"still moving after {done.iterations} passes; more noise would slow it less"
+        found = done.found
+        learnt = Learnt(found.s - affine, found.s - s, found.P, forecast)
+        after = GaussianState(
+            found.s,
+            found.P,
+            prior.filled(found.s),
+            process,
+            self.noise.learn(noise, learnt),
+            done.alpha,
+            refusals,
+            snapshot_rejections,
+            found.chol_P,
+        )
+        return after, done.told.info(status, snapshot, rows, detail)
+
+    def _refused(
+        self, state: GaussianState, done: Update, rows: IntArray, judge: GrossErrorTest
+    ) -> tuple[IntArray, int]:
+        """How often in a row each channel, and snapshots as a whole, were refused."""
+        found = done.found
+        open_gate = found.nis > robust.gate(len(rows))[0]
+        if judge is robust.trace:
+            refused = done.innovation**2 > robust.MARGIN * found.variance
+        else:
+            # What contradicts and was believed all the same was not understood either.
+            refused = (found.inflation > 0) | open_gate
+        refusals = np.zeros(len(state.refusals), dtype=np.int64)
+        refusals[rows] = np.where(refused, state.refusals[rows] + 1, 0)
+        snapshot_rejections = self.robustness.judge is robust.trace and (
+            open_gate or found.inflation.any()
+        )
+        return refusals, state.snapshot_rejections + 1 if snapshot_rejections else 0
+
+
+def _through(transition: FloatArray, root: FloatArray) -> FloatArray:
+    """F L, with F = transition ⊗ I."""
+    if transition.size == 1:
+        return float(transition[0, 0]) * root
+    blocks = root.reshape(len(transition), -1, root.shape[1])
+    return np.asarray(np.einsum("ij,jnk->ink", transition, blocks).reshape(root.shape))
+
+
+def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianFilter) -> Estimator:
+    """Estimator that starts a filter from weighted least squares.
+
+    Parameters
+    ----------
+    name : str
+        Of the method.
+    network : Network
+    layout : SensorLayout
+    made : GaussianFilter
+
+    Returns
+    -------
+    Estimator
+        It uses every sample once, with the σ that its age gave it.
+    """
+    wls = WeightedLeastSquares(network, layout)
+    columns = made.model.columns
+    inside = np.ix_(columns, columns)
+
+    def init(snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
+        solution, info = begin(wls, snapshot)
+        if solution is None:
+            return None, info
+        return made.begin(solution.x, solution.covariance()[inside], snapshot.time), info
+
+    def read(state: GaussianState) -> Voltages:
+        covariance = np.zeros((len(state.x), len(state.x)))
+        covariance[inside] = state.P[: len(columns), : len(columns)]
+        return Voltages(state.x, covariance)
+
+    def widened(state: GaussianState) -> GaussianState:
+        root = None if state.chol_P is None else WIDER * state.chol_P
+        return replace(state, P=WIDER**2 * state.P, chol_P=root)
+
+    return Estimator(name, init, made.step, read, widened)

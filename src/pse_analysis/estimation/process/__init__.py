@@ -1,0 +1,1 @@
+"""How a state may move between instants: dynamics and process noise."""
