@@ -48,6 +48,15 @@ def read_parameters(case: Case, stage: Stage) -> dict[str, str]:
     return {key: canonical(texts.get(key, case.sections.get(key))) for key in stage.keys}
 
 
+def filters(case: Case, stage: Stage) -> list[str]:
+    """Names of the filters that a stage runs, whatever else the case file says."""
+    section = case.sections.get("estimate") if "estimate" in stage.keys else None
+    tables = section.get("methods") if isinstance(section, Mapping) else None
+    listed = tables if isinstance(tables, list) else []
+    found = [table.get("filter") for table in listed if isinstance(table, Mapping)]
+    return [name for name in found if isinstance(name, str)]
+
+
 def inputs(
     stage: Stage, raw_files: Mapping[str, Facts], entries: Mapping[str, Entry]
 ) -> dict[str, str]:

@@ -20,6 +20,10 @@ from pse_analysis.files import digest_file
 PACKAGE = "pse_analysis"
 SOURCE_ROOT = Path(__file__).resolve().parents[2]
 FINGERPRINT_BYTES = 10
+ESTIMATORS = "pse_analysis.estimators"
+"""Entry points by which installed packages offer methods."""
+BUILT_IN = frozenset({"wls", "kalman", "ukf", "ekf", "observer"})
+"""Methods of this package, whose code is that of the estimate stage."""
 
 # Only absolute imports are allowed in this package, and each stands on lines of its own, so that
 # this pattern finds what `ast` would (a test compares the two) at a tenth of its time.
@@ -104,6 +108,40 @@ def digest_code(modules: Iterable[str]) -> dict[str, str]:
         path = module_file(module)
         if path is not None:
             digests[module] = digest_file(path)
+    return digests
+
+
+def digest_installed(filters: Iterable[str]) -> dict[str, str]:
+    """Digest of each source file of the installed packages that offer the given methods.
+
+    Parameters
+    ----------
+    filters
+        Names of methods as case files have them; those of this package are passed over.
+
+    Notes
+    -----
+    A package is found without being imported, which would be too slow for a cached run and would
+    run code of it before anyone asked for that.
+    """
+    wanted = set(filters) - BUILT_IN
+    if not wanted:
+        return {}
+    # Both cost some time, and few cases need them.
+    from importlib import metadata
+    from importlib.util import find_spec
+
+    digests: dict[str, str] = {}
+    for point in metadata.entry_points(group=ESTIMATORS):
+        spec = find_spec(point.module.split(".")[0]) if point.name in wanted else None
+        if spec is None:
+            continue
+        folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+        files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+        if not folders and spec.origin is not None:
+            files = [Path(spec.origin)]
+        for path in files:
+            digests[f"{point.name}: {path.name} {len(digests)}"] = digest_file(path)
     return digests
 
 

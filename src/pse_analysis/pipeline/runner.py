@@ -31,13 +31,14 @@ from pse_analysis.pipeline import memory, space
 from pse_analysis.pipeline.cache import MANIFEST, READ_ONLY, SUMMARY, CacheError, Entry, Store, lock
 from pse_analysis.pipeline.case import Case, load_case
 from pse_analysis.pipeline.descent import (
+    filters,
     inputs,
     older,
     profiles_folder,
     read_parameters,
     simulation_inputs,
 )
-from pse_analysis.pipeline.fingerprint import closure, digest_code, fingerprint
+from pse_analysis.pipeline.fingerprint import closure, digest_code, digest_installed, fingerprint
 from pse_analysis.pipeline.plan import NAMES, STAGES, Job, Options, Reporter, Result, Stage, Work
 from pse_analysis.pipeline.provenance import provenance
 from pse_analysis.pipeline.raw_folder import RawFolder, foreign
@@ -229,7 +230,7 @@ class _Run:
             stage.name,
             parameters=read_parameters(self.case, stage),
             inputs=inputs(stage, raw_files, entries),
-            code=code(stage),
+            code={**code(stage), **digest_installed(filters(self.case, stage))},
         )
 
     def _is_damaged(self, stage: str, entry: Entry, *, thorough: bool = False) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -22,6 +23,8 @@ from pse_analysis.measurement import MeasurementModel, SensorLayout
 
 MOST_PASSES = 100
 """Linearisations of one step; what has not converged by then never does."""
+FORGETTING = 0.97
+"""b of Sage and Husa where it is not said."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Composition:
     robustness: Literal["none", "trace", "per_channel"] = "none"
     protected: bool = True
     passes: int = 1
-    forgetting: float = 0.97
+    forgetting: float = FORGETTING
     holt: HoltParams = field(default_factory=HoltParams)
     points: Scaling = field(default_factory=Scaling)
     protection: Protection = field(default_factory=Protection)
@@ -72,6 +75,22 @@ class Composition:
             raise ParameterError(
                 f"compose: expected 0 < forgetting < 1, received {self.forgetting}"
             )
+        for key, needed in self._without_effect():
+            raise ParameterError(f"compose.{key} has no effect here: drop it, or {needed}")
+
+    def _without_effect(self) -> Iterator[tuple[str, str]]:
+        """Numbers of parts that are not there, each with what it needs."""
+        judged = self.robustness != "none"
+        if self.process == "random_walk" and self.holt != HoltParams():
+            yield "holt", 'take process = "holt" or "local_trend"'
+        if self.learning == "none" and self.forgetting != FORGETTING:
+            yield "forgetting", 'take learning = "sage_husa"'
+        if not judged and not self.protected:
+            yield "protected", 'take robustness = "trace" or "per_channel"'
+        if not (judged and self.protected) and self.protection != Protection():
+            yield "protection", 'take a robustness other than "none" and protected = true'
+        if self.scaling == "likelihood" and self.points.alpha != Scaling().alpha:
+            yield "points.alpha", 'take scaling = "fixed" or "moments"'
 
 
 def process_of(composition: Composition) -> dynamics.Process:

@@ -209,7 +209,8 @@ class GaussianFilter:
         else:
             # What contradicts and was believed all the same was not understood either.
             refused = (found.inflation > 0) | open_gate
-        refusals = np.zeros(len(state.refusals), dtype=np.int64)
+        # A meter that did not report stays as often refused as it was.
+        refusals = state.refusals.copy()
         refusals[rows] = np.where(refused, state.refusals[rows] + 1, 0)
         snapshot_rejections = self.robustness.judge is robust.trace and (
             open_gate or found.inflation.any()
