@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import ClassVar, Literal
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import machine
+from pse_analysis.estimation import machine, variants
 from pse_analysis.estimation.bad_data.innovation_test import InnovationTest, Refuse, refuse
 from pse_analysis.estimation.core.interface import Estimator
 from pse_analysis.estimation.filters import composition, intervals, restart
@@ -27,6 +27,8 @@ from pse_analysis.measurement.rectangular import Linearisation
 
 VARIANCE = 1e-6
 """q of ``scalar`` noise where a method does not say it. [p.u.², rad²]"""
+MOST_AHEAD = 1000
+"""Most steps that a forecast may reach."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,11 @@ class GridFilter(GridMethod):
         What the filter is made of; each kind has some of the parts.
     restart : RestartParams
         When the filter starts again.
+    smooth : bool
+        Whether every instant is also estimated from all of them, the later ones included; stands
+        in the tables as the method ``NAME_smoothed``.
+    ahead : tuple of int
+        Steps ahead of which forecasts are made; these stand as ``NAME_ahead_N``.
     """
 
     parts: ClassVar[tuple[str, ...]] = ()
@@ -122,6 +129,8 @@ class GridFilter(GridMethod):
     history: HistoryParams | None = None
     compose: Composition = field(default_factory=Composition)
     restart: RestartParams = field(default_factory=RestartParams)
+    smooth: bool = False
+    ahead: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -132,6 +141,22 @@ class GridFilter(GridMethod):
                 f"[estimate.methods] {self.name!r}: expected variance > 0 and source_sigma ≥ 0, "
                 f"both finite, received {self.variance} and {self.source_sigma}"
             )
+        if not all(1 <= steps <= MOST_AHEAD for steps in self.ahead) or (
+            len(set(self.ahead)) < len(self.ahead)
+        ):
+            raise ParameterError(
+                f"[estimate.methods] {self.name!r}: expected ahead to list different numbers of "
+                f"steps in 1 … {MOST_AHEAD}, received {list(self.ahead)}"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names by which it stands in tables."""
+        return (
+            self.name,
+            *((variants.smoothed_name(self.name),) if self.smooth else ()),
+            *(variants.ahead_name(self.name, steps) for steps in self.ahead),
+        )
 
     def without_effect(self) -> Iterator[tuple[str, str]]:
         yield from super().without_effect()
@@ -231,6 +256,7 @@ class KalmanFilter(GridFilter):
             step_s=setting.study.step_s,
             reach_s=intervals.usual_reach(history, layout, setting.study.step_s),
             instant=self.reading == "instant",
+            smooth=self.smooth,
             refuse=self._refuse() if self.screening == "innovation" else None,
             process=composition.process_of(self.compose),
             linearisation=self.linearisation,

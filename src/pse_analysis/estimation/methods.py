@@ -95,6 +95,11 @@ class Method:
                 f"[estimate.methods] {self.name!r}: {key} has no effect here: drop it, or {needed}"
             )
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names by which it stands in tables: its own, and those of its variants if it has any."""
+        return (self.name,)
+
     @staticmethod
     def of(name: str, filter: str, **given: Any) -> Method:
         """Method of a kind with some of its parameters, as a case file would give them.

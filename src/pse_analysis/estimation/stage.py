@@ -7,10 +7,11 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import GridError, NotConverged, TableError, Unobservable
-from pse_analysis.estimation import machine
+from pse_analysis.estimation import machine, variants
 from pse_analysis.estimation.core.interface import Estimator, Info
 from pse_analysis.estimation.core.run import Estimated, States, run
 from pse_analysis.estimation.core.snapshots import record
+from pse_analysis.estimation.kinds import GridFilter
 from pse_analysis.estimation.methods import Factory, Method, Setting
 from pse_analysis.machine import Machine
 from pse_analysis.measurement import Model, SensorLayout
@@ -82,12 +83,22 @@ def estimate(
         estimator = factory(setting)
     except (GridError, NotConverged, Unobservable) as error:
         estimator = _without_estimates(name, layout, str(error))
+    reference = None if truth is None else true_states(truth, model, studied.time, trial)
     if isinstance(model, Machine):
         snapshots, layout = machine.snapshots(studied, layout, model)
+        result = run(estimator, snapshots, model, layout, trial=trial, truth=reference)
     else:
-        snapshots = studied.snapshots()
-    reference = None if truth is None else true_states(truth, model, studied.time, trial)
-    result = run(estimator, snapshots, model, layout, trial=trial, truth=reference)
+        smooth, ahead = (method.smooth, method.ahead) if isinstance(method, GridFilter) else (0, ())
+        result = variants.run(
+            estimator,
+            list(studied.snapshots()),
+            model,
+            layout,
+            smooth=bool(smooth),
+            ahead=ahead,
+            trial=trial,
+            truth=reference,
+        )
     return Estimated(
         check("estimated", result.estimated),
         check("residuals", result.residuals),

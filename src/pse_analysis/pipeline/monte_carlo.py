@@ -65,7 +65,7 @@ def monte_carlo(
     curves : Path, optional
         Folder of load profiles; that of the project if not given.
     progress : callable, optional
-        UpdateReport how many realisations of how many are done.
+        Told how many realisations of how many are done.
 
     Returns
     -------

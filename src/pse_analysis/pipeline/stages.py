@@ -94,7 +94,7 @@ def check_case(case: Case) -> Parameters:
             estimate=part(EstimateParams, "estimate"),
             score=part(ScoreParams, "score"),
         )
-        names = [method.name for method in parameters.estimate.methods]
+        names = [name for method in parameters.estimate.methods for name in method.names]
         for name in names:
             if names.count(name) > 1:
                 raise ParameterError(
@@ -316,7 +316,7 @@ def _score(job: Job) -> None:
         params=params.validate,
         model=model,
     )
-    methods = [m.name for m in params.estimate.methods]
+    methods = [name for m in params.estimate.methods for name in m.names]
     shown = job.case.title, scored, told.findings, methods, told.notices
     (job.output / SUMMARY).write_text(text(*shown), encoding="utf-8")
     job.progress(2, 3, "recording")

@@ -189,7 +189,7 @@ def step(
     turn: FloatArray | float = np.inf,
     kind: IntArray | None = None,
 ) -> tuple[AdaptiveState, Decision]:
-    """GrossErrorTest one sample of each channel.
+    """Judge one sample of each channel.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def screen(
     turn: FloatArray | float = np.inf,
     kind: IntArray | None = None,
 ) -> Decision:
-    """GrossErrorTest whole records, sample by sample.
+    """Judge whole records, sample by sample.
 
     Parameters
     ----------

@@ -129,4 +129,11 @@ def screened(
     def read(state: ScreenedState) -> Estimate | None:
         return None if state.inner is None else estimator.read(state.inner)
 
-    return Estimator(estimator.name, init, step, read)
+    dynamics = estimator.dynamics
+    return Estimator(
+        estimator.name,
+        init,
+        step,
+        read,
+        dynamics=None if dynamics is None else dynamics.inside(lambda state: state.inner),
+    )

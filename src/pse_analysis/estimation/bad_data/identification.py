@@ -84,7 +84,7 @@ class Deletion:
         self._columns = columns
 
     def without(self, left_out: BoolArray) -> DeletionResiduals:
-        """DeletionResiduals of every measurement when some are left out. (m,)"""
+        """Residuals of every measurement when some are left out. (m,)"""
         out = np.flatnonzero(left_out)
         rest = self._rest(out)
         known = rest.diagonal > self._floor

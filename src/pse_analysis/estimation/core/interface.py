@@ -8,7 +8,7 @@ into an estimate with its covariance: of a grid's voltages, or of a machine's ro
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +58,10 @@ class Snapshot:
     age_s: FloatArray
     inputs: FloatArray | None = None
     topology: str = ""
+
+    def silent(self) -> Snapshot:
+        """The same instant without any measurement."""
+        return replace(self, available=np.zeros_like(self.available))
 
     @property
     def sigma_own(self) -> FloatArray:
@@ -134,10 +138,57 @@ Voltages = Estimate
 """An estimate of a grid in polar form."""
 
 
+class Transition(NamedTuple):
+    """How a filter's state moves to the next instant before anything is measured there.
+
+    Attributes
+    ----------
+    mean : (N,) ndarray
+        s⁻ at the later instant.
+    covariance : (N, N) ndarray
+        P⁻ of it.
+    cross : (N, N) ndarray
+        Cov(s, s⁻⁺) = P Fᵀ of the earlier state (rows) and the later one (columns).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    cross: FloatArray
+
+
+class Dynamics(NamedTuple):
+    """What a smoother needs of a filter, whose state it knows as a mean s and a covariance P.
+
+    Attributes
+    ----------
+    belief : state -> (s (N,), P (N, N))
+    predict : (state, time) -> Transition
+    read : (state, s, P) -> Estimate
+        Estimate of a mean and covariance that stand in the place of the state's own.
+    difference : (s, s) -> (N,) ndarray
+        s₁ - s₂, angles taken by their shorter way.
+    """
+
+    belief: Callable[[Any], tuple[FloatArray, FloatArray]]
+    predict: Callable[[Any, np.datetime64], Transition]
+    read: Callable[[Any, FloatArray, FloatArray], Estimate]
+    difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract
+
+    def inside(self, unwrap: Callable[[Any], Any]) -> Dynamics:
+        """The same for a state that holds the filter's own among other things."""
+        return Dynamics(
+            lambda state: self.belief(unwrap(state)),
+            lambda state, time: self.predict(unwrap(state), time),
+            lambda state, s, P: self.read(unwrap(state), s, P),
+            self.difference,
+        )
+
+
 class Estimator(NamedTuple):
     """A method: three functions over an opaque state.
 
-    ``widened``, where it is given, makes a state far more uncertain.
+    ``widened``, where it is given, makes a state far more uncertain; ``dynamics`` lets a smoother
+    look back from later instants.
     """
 
     name: str
@@ -145,3 +196,4 @@ class Estimator(NamedTuple):
     step: Callable[[Any, Snapshot], tuple[Any, Info]]
     read: Callable[[Any], Estimate | None]
     widened: Callable[[Any], Any] | None = None
+    dynamics: Dynamics | None = None

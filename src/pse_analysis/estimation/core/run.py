@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +29,9 @@ CONSISTENCY_RATIO = (0.5, 2.0)
 Real load is heavy-tailed and its volatility changes with the hour, so that the χ² bounds alone,
 which are right for a filter's own model, would condemn every filter.
 """
+
+
+Watch = Callable[[int, Any, Info], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,28 @@ class _Trace:
     info: list[Info] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
+    def add(
+        self,
+        time: np.datetime64,
+        info: Info,
+        seconds: float,
+        estimate: Estimate | None,
+        truth: FloatArray | None,
+        states: States,
+    ) -> None:
+        """Note a step."""
+        nothing = np.full(len(states), np.nan)
+        self.time.append(time)
+        self.info.append(info)
+        self.seconds.append(seconds)
+        self.x.append(nothing if estimate is None else estimate.x)
+        self.sigma.append(
+            nothing
+            if estimate is None
+            else np.sqrt(np.maximum(np.diagonal(estimate.covariance), 0.0))
+        )
+        self.nees.append(_nees(estimate, truth, states.folded))
+
 
 def run(
     estimator: Estimator,
@@ -100,6 +125,7 @@ def run(
     *,
     trial: int = 0,
     truth: FloatArray | None = None,
+    watch: Sequence[Watch] = (),
 ) -> Estimated:
     """Run an estimator over snapshots; no snapshot stops the run.
 
@@ -112,6 +138,8 @@ def run(
     trial : int
     truth : (T, n) ndarray, optional
         True states at the instants, for NEES: [θ; |V|] [rad, p.u.], or [θ; ω] [rad, rad/s].
+    watch : sequence of callable
+        Told the number of every instant, the state after it (None if there is none) and its info.
 
     Returns
     -------
@@ -120,7 +148,6 @@ def run(
     trace = _Trace()
     state: Any = None
     states = States.of(model)
-    nothing = np.full(len(states), np.nan)
     for k, snapshot in enumerate(snapshots):
         begun = time.perf_counter()
         state, info, estimate = _outlived(estimator, state, snapshot, len(layout))
@@ -132,18 +159,39 @@ def run(
             info = Info.nothing(
                 len(layout), Status.DIVERGED, "the state is not finite: it restarts next instant"
             )
-        trace.time.append(snapshot.time)
-        trace.info.append(info)
-        trace.seconds.append(seconds)
-        trace.x.append(nothing if estimate is None else estimate.x)
-        trace.sigma.append(
-            nothing
-            if estimate is None
-            else np.sqrt(np.maximum(np.diagonal(estimate.covariance), 0.0))
+        trace.add(
+            snapshot.time, info, seconds, estimate, None if truth is None else truth[k], states
         )
-        reference = None if truth is None else truth[k]
-        trace.nees.append(_nees(estimate, reference, states.folded))
+        for see in watch:
+            see(k, state, info)
     return _tables(estimator.name, trial, trace, states, layout)
+
+
+def derived(
+    name: str,
+    trial: int,
+    given: Sequence[tuple[np.datetime64, Info, Estimate | None, FloatArray | None]],
+    seconds: float,
+    model: Model,
+    layout: SensorLayout,
+) -> Estimated:
+    """Tables of estimates that were made from those of a run, as a method of their own.
+
+    Parameters
+    ----------
+    name : str
+    trial : int
+    given : sequence of tuple
+        Time, info, estimate (None if there is none) and true state (n,) if it is known.
+    seconds : float
+        Time that all of them took. [s]
+    model : Network or Machine
+    layout : SensorLayout
+    """
+    trace, states = _Trace(), States.of(model)
+    for when, info, estimate, truth in given:
+        trace.add(when, info, seconds / len(given), estimate, truth, states)
+    return _tables(name, trial, trace, states, layout)
 
 
 def _outlived(

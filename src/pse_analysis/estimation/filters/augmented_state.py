@@ -215,6 +215,16 @@ class AugmentedState:
                 out[block, :, other] = present[i, :, j]
         return Belief(x.ravel(), out.reshape(blocks * n, blocks * n), memory)
 
+    def cross(self, belief: Belief) -> FloatArray:
+        """Covariance of a state (rows) and the one that it moves to (columns). (B·n, B·n)"""
+        n, past, blocks = self.n, self.past, self.blocks
+        P = belief.P.reshape(blocks, n, blocks * n)
+        moved = np.empty_like(P)
+        moved[1:past] = P[: past - 1]
+        for i, block in enumerate(self.head):
+            moved[block] = self._carried(P, i)
+        return moved.reshape(blocks * n, blocks * n).T
+
     def _carried(self, blocks: FloatArray, i: int) -> FloatArray:
         """Part i of F s from the blocks of a state, along the first axis."""
         row = self.process.transition[i]

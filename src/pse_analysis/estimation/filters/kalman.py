@@ -17,7 +17,14 @@ import numpy.typing as npt
 
 from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.core.cholesky import cleaned
-from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.core.interface import (
+    Dynamics,
+    Estimator,
+    Info,
+    Snapshot,
+    Transition,
+    Voltages,
+)
 from pse_analysis.estimation.filters import intervals
 from pse_analysis.estimation.filters.augmented_state import AugmentedState, Belief, Reach, Rows
 from pse_analysis.estimation.filters.conditioning import Prior, Solved
@@ -76,6 +83,7 @@ class KalmanFilter:
         step_s: float,
         lags: int,
         instant: bool,
+        smooth: bool,
         refuse: Refuse | None,
         process: dynamics.Process,
         linearisation: Linearisation,
@@ -84,7 +92,9 @@ class KalmanFilter:
         self.step_s, self.instant, self.refuse = step_s, instant, refuse
         self.linearisation = linearisation
         self.model = RectangularModel(network, layout)
-        self.lagged = AugmentedState(2 * network.n_bus, lags, process)
+        # A smoother looks back from a state that knows all instants that were read.
+        self._readable = lags
+        self.lagged = AugmentedState(2 * network.n_bus, lags + 1 if smooth else lags, process)
         self._noise = noise
         # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
         self._held = None if layout.has_angle else network.n_bus + network.slack
@@ -92,7 +102,7 @@ class KalmanFilter:
         self._rows: Memo[Rows] = Memo()
         self._reaches: Memo[Reach] = Memo()
 
-    def walk(
+    def process_noise(
         self, memory: Matched | None, x: FloatArray, time: np.datetime64
     ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
         """Q (2N, 2N) of the step to an instant, at a forecast; its shapes if it is estimated."""
@@ -122,16 +132,15 @@ class KalmanFilter:
         """State from a voltage and the covariance (2N, 2N) of its [e; f]."""
         x = np.concatenate([voltage.real, voltage.imag])
         noise = self._noise.begin() if isinstance(self._noise, CovarianceMatching) else None
-        return KalmanState(*self.lagged.begin(x, covariance, self.walk(noise, x, time)[0]), noise)
+        return KalmanState(
+            *self.lagged.begin(x, covariance, self.process_noise(noise, x, time)[0]), noise
+        )
 
     def step(self, state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
         """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
         m = len(self.layout)
         belief = Belief(state.x, state.P, state.process)
-        forecast = self.lagged.forecast(belief)
-        walk, shapes = self.walk(state.noise, forecast[0], snapshot.time)
-        noise = self.lagged.process.noise(walk)
-        prior = self.lagged.moved(belief, forecast, noise)
+        prior, noise, shapes = self._moved(belief, state.noise, snapshot.time)
         used, sigma = self._usable(snapshot)
         told, refused = np.full((2, m), np.nan), np.zeros(m, dtype=bool)
         given = belief, prior, noise, snapshot, sigma
@@ -180,6 +189,28 @@ class KalmanFilter:
             reasons=_refusals(refused),
         )
 
+    def _moved(
+        self, belief: Belief, memory: Matched | None, time: np.datetime64
+    ) -> tuple[Belief, FloatArray, tuple[FloatArray, ...]]:
+        """The state at an instant before its measurements, Q of the step, and its shapes."""
+        forecast = self.lagged.forecast(belief)
+        walk, shapes = self.process_noise(memory, forecast[0], time)
+        noise = self.lagged.process.noise(walk)
+        return self.lagged.moved(belief, forecast, noise), noise, shapes
+
+    def predict(self, state: KalmanState, time: np.datetime64) -> Transition:
+        """How the state moves to a later instant without measurements there."""
+        belief = Belief(state.x, state.P, state.process)
+        prior, _, _ = self._moved(belief, state.noise, time)
+        return Transition(prior.x, prior.P, self.lagged.cross(belief))
+
+    def estimate(self, x: FloatArray, P: FloatArray) -> Voltages:
+        """Present voltages in polar form."""
+        n, voltage = self.n_bus, self.voltage(x)
+        turn = to_polar(voltage)
+        covariance = turn @ P[: 2 * n, : 2 * n] @ turn.T
+        return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
+
     def _expanded(
         self, reading: RowMoments, instants: ComplexArray | None = None
     ) -> tuple[Expansion, Solved]:
@@ -209,9 +240,7 @@ class KalmanFilter:
         """Rows that are used, and their σ."""
         if self.instant:
             return snapshot.available, snapshot.sigma
-        near = intervals.covered(
-            snapshot.age_s, self.layout.window_s, self.step_s, self.lagged.lags
-        )
+        near = intervals.covered(snapshot.age_s, self.layout.window_s, self.step_s, self._readable)
         return snapshot.available & snapshot.fresh & near, snapshot.sigma_own
 
     def _reading(
@@ -249,6 +278,7 @@ def kalman_filter(
     step_s: float,
     reach_s: float = 0.0,
     instant: bool = False,
+    smooth: bool = False,
     refuse: Refuse | None = None,
     process: dynamics.Process | None = None,
     linearisation: Linearisation = "derivative",
@@ -272,6 +302,8 @@ def kalman_filter(
         Whether every value counts as one of the present instant, with the σ that its age adds, and
         held values count again. Cheap, and what [qi2025] does; but errors of values that are used
         twice are correlated, so the filter is too sure of itself.
+    smooth : bool
+        Whether a smoother is to look back from its states, which takes one instant more in each.
     refuse : Refuse, optional
         Asked about the innovation before every update; rows that it names are left out, and stand
         in the info with their innovation.
@@ -301,6 +333,7 @@ def kalman_filter(
         step_s=step_s,
         lags=lags,
         instant=instant,
+        smooth=smooth,
         refuse=refuse,
         process=process or dynamics.random_walk(),
         linearisation=linearisation,
@@ -317,15 +350,15 @@ def kalman_filter(
         return made.begin(voltage, turn @ solution.covariance() @ turn.T, snapshot.time), info
 
     def read(state: KalmanState) -> Voltages:
-        voltage = made.voltage(state.x)
-        turn = to_polar(voltage)
-        covariance = turn @ state.P[: 2 * n, : 2 * n] @ turn.T
-        return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
+        return made.estimate(state.x, state.P)
 
     def widened(state: KalmanState) -> KalmanState:
         return replace(state, P=WIDER**2 * state.P)
 
-    return Estimator(name, init, made.step, read, widened)
+    moves = Dynamics(
+        lambda state: (state.x, state.P), made.predict, lambda _state, x, P: made.estimate(x, P)
+    )
+    return Estimator(name, init, made.step, read, widened, moves)
 
 
 def _refusals(refused: BoolArray) -> npt.NDArray[np.int32]:

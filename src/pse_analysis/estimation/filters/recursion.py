@@ -7,14 +7,21 @@ innovation, condition. What is composed: process × observation × noise × robu
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.estimation.bad_data import robust
 from pse_analysis.estimation.bad_data.robust import GrossErrorTest, Protection
-from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot, Voltages
+from pse_analysis.estimation.core.interface import (
+    Dynamics,
+    Estimator,
+    Info,
+    Snapshot,
+    Transition,
+    Voltages,
+)
 from pse_analysis.estimation.filters.conditioning import Prior
 from pse_analysis.estimation.filters.protection import Recovery
 from pse_analysis.estimation.filters.restart import WIDER
@@ -25,7 +32,7 @@ from pse_analysis.estimation.process.sage_husa import Learnt, Noise
 from pse_analysis.estimation.static.robust_wls import begin
 from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement import VA, VM, MeasurementModel, SensorLayout
+from pse_analysis.measurement import VA, VM, MeasurementModel, SensorLayout, wrap
 from pse_analysis.vocabulary import Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -83,6 +90,15 @@ class GaussianState:
     chol_P: FloatArray | None = None
 
 
+class _Moved(NamedTuple):
+    """F s + g, F P Fᵀ, and what process and noise remember."""
+
+    affine: FloatArray
+    covariance: FloatArray
+    process: Any
+    noise: Any
+
+
 class GaussianFilter:
     """A filter for one sensor layout.
 
@@ -133,24 +149,13 @@ class GaussianFilter:
     def step(self, state: GaussianState, snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
         """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
         m = self.model.shape[0]
-        s, forecast, process = self.process.forecast(state.s, state.P, state.process)
-        columns = self.model.columns
-        ahead = state.x.copy()
-        ahead[columns] = s[: len(columns)]
-        drift, covariance, noise = self.noise.current(state.noise, ahead, snapshot.time)
-        affine = s
-        s = s + drift
-        x = state.x.copy()
-        x[columns] = s[: len(columns)]
-        root = state.chol_P
-        if root is not None:
-            root = carried(_through(self.process.transition, root), covariance)
-        prior = Prior(s, forecast + covariance, x, columns, root)
+        prior, moved = self._moved(state, snapshot.time)
         used = snapshot.available & snapshot.fresh
         if not used.any():
-            return replace(state, s=s, P=prior.P, x=x, process=process, chol_P=root), Info.nothing(
-                m, Status.PREDICTED
+            ahead = replace(
+                state, s=prior.s, P=prior.P, x=prior.x, process=moved.process, chol_P=prior.carried
             )
+            return ahead, Info.nothing(m, Status.PREDICTED)
         rows = self._order[used[self._order]]
         judge, status, detail = self.robustness.judge, Status.OK, ""
         if (
@@ -184,19 +189,56 @@ class GaussianFilter:
             status = Status.NOT_CONVERGED
             detail = f"still moving after {done.iterations} passes; more noise would slow it less"
         found = done.found
-        learnt = Learnt(found.s - affine, found.s - s, found.P, forecast)
+        learnt = Learnt(found.s - moved.affine, found.s - prior.s, found.P, moved.covariance)
         after = GaussianState(
             found.s,
             found.P,
             prior.filled(found.s),
-            process,
-            self.noise.learn(noise, learnt),
+            moved.process,
+            self.noise.learn(moved.noise, learnt),
             done.alpha,
             refusals,
             snapshot_rejections,
             found.chol_P,
         )
         return after, done.told.info(status, snapshot, rows, detail)
+
+    def _moved(self, state: GaussianState, time: np.datetime64) -> tuple[Prior, _Moved]:
+        """The state at an instant before its measurements."""
+        s, forecast, process = self.process.forecast(state.s, state.P, state.process)
+        columns = self.model.columns
+        ahead = state.x.copy()
+        ahead[columns] = s[: len(columns)]
+        drift, covariance, noise = self.noise.current(state.noise, ahead, time)
+        root = state.chol_P
+        if root is not None:
+            root = carried(_through(self.process.transition, root), covariance)
+        moved = _Moved(s, forecast, process, noise)
+        s = s + drift
+        x = state.x.copy()
+        x[columns] = s[: len(columns)]
+        return Prior(s, forecast + covariance, x, columns, root), moved
+
+    def predict(self, state: GaussianState, time: np.datetime64) -> Transition:
+        """How the state moves to a later instant without measurements there."""
+        prior, _ = self._moved(state, time)
+        return Transition(prior.s, prior.P, _through(self.process.transition, state.P).T)
+
+    def difference(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        """s₁ - s₂, angles taken by their shorter way."""
+        out = one - other
+        angles = np.flatnonzero(self.model.columns < self.model.network.n_bus)
+        out[angles] = wrap(out[angles])
+        return np.asarray(out)
+
+    def estimate(self, state: GaussianState, s: FloatArray, P: FloatArray) -> Voltages:
+        """[θ; |V|] of a mean and covariance of this filter's state."""
+        columns = self.model.columns
+        x = state.x.copy()
+        x[columns] = s[: len(columns)]
+        covariance = np.zeros((len(x), len(x)))
+        covariance[np.ix_(columns, columns)] = P[: len(columns), : len(columns)]
+        return Voltages(x, covariance)
 
     def _refused(
         self, state: GaussianState, done: Update, rows: IntArray, judge: GrossErrorTest
@@ -253,12 +295,13 @@ def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianF
         return made.begin(solution.x, solution.covariance()[inside], snapshot.time), info
 
     def read(state: GaussianState) -> Voltages:
-        covariance = np.zeros((len(state.x), len(state.x)))
-        covariance[inside] = state.P[: len(columns), : len(columns)]
-        return Voltages(state.x, covariance)
+        return made.estimate(state, state.s, state.P)
 
     def widened(state: GaussianState) -> GaussianState:
         root = None if state.chol_P is None else WIDER * state.chol_P
         return replace(state, P=WIDER**2 * state.P, chol_P=root)
 
-    return Estimator(name, init, made.step, read, widened)
+    dynamics = Dynamics(
+        lambda state: (state.s, state.P), made.predict, made.estimate, made.difference
+    )
+    return Estimator(name, init, made.step, read, widened, dynamics)

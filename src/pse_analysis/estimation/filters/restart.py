@@ -150,8 +150,8 @@ class Guard:
             if told.detail:
                 detail += f", {told.detail}"
             return begun, replace(told, status=Status.RESTARTED, detail=detail)
-        ahead, _ = self._tried(self.inner.step, state.inner, _silent(snapshot))
-        if ahead is None or self.impossible(ahead, _silent(snapshot)):
+        ahead, _ = self._tried(self.inner.step, state.inner, snapshot.silent())
+        if ahead is None or self.impossible(ahead, snapshot.silent()):
             return None, Info.nothing(len(self.layout), Status.DIVERGED, why)
         skipped = state.skipped + 1
         if skipped > self.params.patience and self.inner.widened is not None:
@@ -223,9 +223,11 @@ def guarded(
         forecast nor the snapshot alone could be reconciled.
     """
     made = Guard(estimator, layout, params or RestartParams())
-    return Estimator(estimator.name, made.init, made.step, made.read)
-
-
-def _silent(snapshot: Snapshot) -> Snapshot:
-    """The same instant without any measurement."""
-    return replace(snapshot, available=np.zeros_like(snapshot.available))
+    dynamics = estimator.dynamics
+    return Estimator(
+        estimator.name,
+        made.init,
+        made.step,
+        made.read,
+        dynamics=None if dynamics is None else dynamics.inside(lambda state: state.inner),
+    )
