@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from pse_analysis.alignment import AlignParams, align
-from pse_analysis.estimation import Estimated, Method, estimate
+from pse_analysis.estimation import Estimated, Method, Record, estimate, record
 from pse_analysis.grid import power_flow
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout
@@ -157,3 +157,8 @@ def estimate_raw(raw: RawCase, methods: tuple[Method, ...] = METHODS) -> Run:
 def plain_run() -> Run:
     """The run of the tables as they stand here."""
     return estimate_raw(ingest(telemetry(), channel_table(), network()))
+
+
+def record_of(run: Run, layout: SensorLayout) -> Record:
+    """Aligned telemetry of a run as arrays."""
+    return record(run.aligned[run.aligned["trial"] == 0], layout)

@@ -28,8 +28,8 @@ from pse_analysis.estimation import (
     Setting,
     Snapshot,
     estimate,
+    variants,
 )
-from pse_analysis.estimation.core.run import run
 from pse_analysis.estimation.methods import GROUP, KINDS
 from pse_analysis.grid import power_flow
 from pse_analysis.machine import Machine
@@ -92,6 +92,8 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "beta": (0.3,),
     "kappa": (2.0,),
     "protected": (False,),
+    "smooth": (True,),
+    "ahead": ((1, 3),),
 }
 """What each key of a number is changed to; of a name, every other one is tried."""
 
@@ -146,8 +148,15 @@ def probe() -> tuple[Setting, Record]:
 def result(data: Mapping[str, Any]) -> Estimated:
     """What a method makes of the probe."""
     setting, studied = probe()
-    estimator = Method.of("m", **data).estimator(setting)
-    return run(estimator, studied.snapshots(), setting.model, setting.layout)
+    method = Method.of("m", **data)
+    return variants.run(
+        method.estimator(setting),
+        list(studied.snapshots()),
+        setting.model,
+        setting.layout,
+        smooth=getattr(method, "smooth", False),
+        ahead=getattr(method, "ahead", ()),
+    )
 
 
 def same(one: Estimated, other: Estimated) -> bool:
