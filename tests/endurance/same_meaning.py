@@ -66,7 +66,7 @@ CHANNEL_STORAGES: tuple[Callable[[pd.DataFrame], pd.DataFrame], ...] = (
     lambda c: c.assign(sign=c["sign"].astype(float), remark="x"),
     lambda c: c.assign(unit=c["unit"].str.upper()),
     lambda c: c.assign(unit=c["unit"].replace({"pu": "p.u.", "degree": "°"})),
-    lambda c: c.drop(columns=["sign", "aggregation"]),
+    lambda c: c.drop(columns=["sign", "aggregation"], errors="ignore"),
     lambda c: c.assign(side=c["side"].replace("", None)),
     lambda c: c.astype(object),
 )

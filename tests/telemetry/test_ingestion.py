@@ -370,3 +370,21 @@ def test_bus_results_of_another_tool_with_their_shunts_are_refused():
     assert len(ingest(copied, about, network, shunts="accept").telemetry) == 3
     right = copied.assign(value=[flow.vm[bus], -p, -q])
     assert len(ingest(right, about, network).telemetry) == 3
+
+
+def test_a_cell_with_several_numbers_is_refused() -> None:
+    frame = pd.DataFrame(
+        {"channel": "U6", "time_utc": [T, T], "value": [[12.6, 12.7], [12.5, 12.6]]}
+    )
+    with pytest.raises(
+        TableError, match=r"holds lists or arrays, e\.g\. \[12\.6, 12\.7\].*explode"
+    ):
+        ingest(frame, channels(), feeder())
+
+
+def test_a_sign_of_any_number_type_is_one_or_minus_one() -> None:
+    frame = pd.DataFrame({"channel": "PV6", "time_utc": [T], "value": [50.0]})
+    given = channels().assign(sign=np.array([1, -1, 1], dtype=complex))
+    raw = ingest(frame, given, feeder())
+    np.testing.assert_allclose(raw.telemetry["value"], -0.05)
+    assert set(raw.channels["sign"]) == {1}

@@ -242,6 +242,12 @@ def _values(value: pd.Series, row: npt.NDArray[np.intp], channels: pd.DataFrame)
         except (TypeError, ValueError, OverflowError):
             pass
         else:
+            if array.ndim != 1:
+                raise TableError(
+                    "telemetry: column 'value' holds lists or arrays, e.g. "
+                    f"{shown(value.iloc[0])}: expected one number per row; spread them over rows "
+                    "with pandas.DataFrame.explode, each with a time of its own"
+                )
             phasor = value.map(lambda v: isinstance(v, complex | np.complexfloating)).to_numpy()
             real = np.asarray(array.real)
             if phasor.any():
@@ -288,7 +294,8 @@ def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
             f"channels: sign of {row['channel']!r} must be 1, or -1 where the source counts "
             f"consumption as positive; received {shown(row['sign'])}"
         )
-    filled["sign"] = filled["sign"].astype(np.int8)
+    # Whatever type it has, such as a complex 1.
+    filled["sign"] = np.where([_is(sign, 1) for sign in filled["sign"]], 1, -1).astype(np.int8)
     return check_channels(filled.reset_index(drop=True), model)
 
 
