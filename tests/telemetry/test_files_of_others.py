@@ -77,3 +77,12 @@ def test_text_that_is_not_utf8(tmp_path: Path) -> None:
     path = write(tmp_path / "t.parquet", table.set_column(i, "method", broken))
     with pytest.raises(TableError, match=r"not UTF-8.*write it again"):
         telemetry.read_table(path, "scored")
+
+
+def test_names_of_columns_that_are_no_text(tmp_path: Path) -> None:
+    path = write(tmp_path / "t.parquet", scored())
+    content = path.read_bytes()
+    assert content.count(b"metric") > 1
+    path.write_bytes(content.replace(b"metric", b"metr\xdfc"))
+    with pytest.raises(TableError, match="t.parquet"):
+        telemetry.read_table(path, "scored")

@@ -294,8 +294,7 @@ def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
             f"channels: sign of {row['channel']!r} must be 1, or -1 where the source counts "
             f"consumption as positive; received {shown(row['sign'])}"
         )
-    # Whatever type it has, such as a complex 1.
-    filled["sign"] = np.where([_is(sign, 1) for sign in filled["sign"]], 1, -1).astype(np.int8)
+    filled["sign"] = filled["sign"].astype(np.int8)
     return check_channels(filled.reset_index(drop=True), model)
 
 
@@ -319,7 +318,7 @@ def _floats(column: pd.Series) -> pd.Series:
 
 def _is(cell: object, number: int) -> bool:
     """Whether a cell of any kind is that number."""
-    return isinstance(cell, int | float | np.number) and bool(cell == number)
+    return isinstance(cell, int | float | np.integer | np.floating) and bool(cell == number)
 
 
 def _reads_as_number(text: str) -> bool:

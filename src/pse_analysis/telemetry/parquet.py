@@ -27,7 +27,13 @@ MAX_BYTES = 64 * 2**30
 MAX_FOOTER_STRING = 16 * 2**20
 MAX_FOOTER_ITEMS = 2_000_000
 
-UNREADABLE = (pa.ArrowInvalid, pa.ArrowNotImplementedError, pa.ArrowTypeError, OSError)
+UNREADABLE = (
+    pa.ArrowInvalid,
+    pa.ArrowNotImplementedError,
+    pa.ArrowTypeError,
+    OSError,
+    UnicodeDecodeError,
+)
 
 PROVENANCE = b"pse_analysis"
 """Key of a file's metadata under which its provenance stands, as JSON."""
