@@ -105,7 +105,11 @@ def killed(work: Callable[[], Any], after_s: float, *, group: bool) -> bool:
             if os.waitpid(number, os.WNOHANG) != (0, 0):
                 return False
             time.sleep(0.0005)
-        (os.killpg if group else os.kill)(number, signal.SIGKILL)
+        try:
+            (os.killpg if group else os.kill)(number, signal.SIGKILL)
+        except ProcessLookupError:
+            # It has not come to lead a group of its own yet, and has no workers.
+            os.kill(number, signal.SIGKILL)
         os.waitpid(number, 0)
     return True
 

@@ -12,7 +12,7 @@ from simulated_case import PARAMS, STUDY, feeder
 
 from pse_analysis.alignment import align
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import Method, estimate
+from pse_analysis.estimation import Estimated, Method, estimate
 from pse_analysis.simulation.settings import FaultParams
 from pse_analysis.validation import Rule, ValidateParams, validate
 from pse_analysis.vocabulary import Reason
@@ -68,6 +68,29 @@ def test_refused_samples_stand_unused_in_residuals_and_are_counted(reading: str)
     assert (rows["reasons"] & int(Reason.INNOVATION)).all()
     assert (rows["innovation"].abs() > 4 * rows["sigma_innovation"]).mean() > 0.5
     assert (done.steps["rejected"].to_numpy()[SPIKED] >= 1).all()
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_every_filter_has_the_innovation_test(kind: str):
+    """Refused rows are named, and the estimate is all but that without the spike."""
+    keys = {"noise": "scalar", "variance": 1e-5}
+    raw, aligned = telemetry(True)
+    clean, same = telemetry(False)
+    method = Method.of("m", kind, screening="innovation", **keys)
+    plain = Method.of("m", kind, **keys)
+    done = estimate(aligned, raw.channels, feeder(), STUDY, method)
+    rows = spiked_rows(done.residuals)
+    assert (rows["inflation"] > 0).all()
+    assert (rows["reasons"] & int(Reason.INNOVATION)).all()
+    assert (done.steps["rejected"].to_numpy()[SPIKED] >= 1).all()
+
+    def off(found: Estimated) -> float:
+        reference = estimate(same, clean.channels, feeder(), STUDY, plain).estimated
+        vm = found.estimated["quantity"] == "vm_pu"
+        return float((found.estimated["value"] - reference["value"])[vm].abs().max())
+
+    spoilt = off(estimate(aligned, raw.channels, feeder(), STUDY, plain))
+    assert off(done) < 0.25 * spoilt
 
 
 def test_replaced_samples_are_used_with_a_larger_sigma():

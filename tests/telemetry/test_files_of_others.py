@@ -84,5 +84,5 @@ def test_names_of_columns_that_are_no_text(tmp_path: Path) -> None:
     content = path.read_bytes()
     assert content.count(b"metric") > 1
     path.write_bytes(content.replace(b"metric", b"metr\xdfc"))
-    with pytest.raises(TableError, match="t.parquet"):
+    with pytest.raises(TableError, match=r"t\.parquet"):
         telemetry.read_table(path, "scored")

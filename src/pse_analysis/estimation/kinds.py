@@ -80,7 +80,7 @@ class LeastSquares(GridMethod):
     def without_effect(self) -> Iterator[tuple[str, str]]:
         yield from super().without_effect()
         if self.screening == "innovation":
-            yield 'screening = "innovation"', 'take filter = "kalman"'
+            yield 'screening = "innovation"', 'take filter = "kalman", "ukf" or "ekf"'
 
     def unscreened(self, setting: Setting) -> Estimator:
         return tracking_wls(
@@ -113,6 +113,8 @@ class GridFilter(GridMethod):
         What the filter is made of; each kind has some of the parts.
     restart : RestartParams
         When the filter starts again.
+    innovation_test : InnovationTest, optional
+        Numbers of ``screening = "innovation"``; as for the noise by default.
     smooth : bool
         Whether every instant is also estimated from all of them, the later ones included; stands
         in the tables as the method ``NAME_smoothed``.
@@ -129,6 +131,7 @@ class GridFilter(GridMethod):
     history: HistoryParams | None = None
     compose: Composition = field(default_factory=Composition)
     restart: RestartParams = field(default_factory=RestartParams)
+    innovation_test: InnovationTest | None = None
     smooth: bool = False
     ahead: tuple[int, ...] = ()
 
@@ -165,6 +168,8 @@ class GridFilter(GridMethod):
         for key in ("source_sigma", "history"):
             if getattr(self, key) is not None and self.noise != "load":
                 yield key, 'take noise = "load"'
+        if self.innovation_test is not None and self.screening != "innovation":
+            yield "innovation_test", 'take screening = "innovation"'
         plain = Composition()
         for part in fields(Composition):
             if part.name not in self.parts and (
@@ -183,6 +188,15 @@ class GridFilter(GridMethod):
     def unguarded(self, setting: Setting) -> Estimator:
         """The filter without its restarts."""
         raise NotImplementedError(f"{type(self).__name__} has no estimator")
+
+    def refuse(self) -> Refuse | None:
+        """The innovation test, if one is asked for."""
+        if self.screening != "innovation":
+            return None
+        # One variance for all voltages is chosen above whatever they do; loads surprise what is
+        # learnt.
+        usual = InnovationTest(forecast_inflation=1.0) if self.noise == "scalar" else None
+        return refuse(self.innovation_test or usual)
 
     def known_noise(self, setting: Setting) -> ProcessNoise:
         """Process noise of [e; f], learnt or given."""
@@ -218,8 +232,6 @@ class KalmanFilter(GridFilter):
         Whether the filter follows the whole derivative of a power, or reads it as a current that is
         fixed in the frame of the predicted voltage, as [qi2025] does. The latter claims to know the
         angle that all buses share, which powers do not tell.
-    innovation_test : InnovationTest, optional
-        Numbers of ``screening = "innovation"``; as for the noise by default.
     window : float, optional
         Steps after which the weight of an innovation has faded to 1/e, for ``noise =
         "innovation"``; 18 by default.
@@ -229,13 +241,10 @@ class KalmanFilter(GridFilter):
 
     reading: Literal["interval", "instant"] = "interval"
     linearisation: Linearisation = "derivative"
-    innovation_test: InnovationTest | None = None
     window: float | None = None
 
     def without_effect(self) -> Iterator[tuple[str, str]]:
         yield from super().without_effect()
-        if self.innovation_test is not None and self.screening != "innovation":
-            yield "innovation_test", 'take screening = "innovation"'
         if self.window is not None and self.noise != "innovation":
             yield "window", 'take noise = "innovation"'
 
@@ -257,16 +266,10 @@ class KalmanFilter(GridFilter):
             reach_s=intervals.usual_reach(history, layout, setting.study.step_s),
             instant=self.reading == "instant",
             smooth=self.smooth,
-            refuse=self._refuse() if self.screening == "innovation" else None,
+            refuse=self.refuse(),
             process=composition.process_of(self.compose),
             linearisation=self.linearisation,
         )
-
-    def _refuse(self) -> Refuse:
-        # One variance for all voltages is chosen above whatever they do; loads surprise what is
-        # learnt.
-        usual = InnovationTest(forecast_inflation=1.0) if self.noise == "scalar" else None
-        return refuse(self.innovation_test or usual)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,9 +278,10 @@ class PolarFilter(GridFilter):
 
     def without_effect(self) -> Iterator[tuple[str, str]]:
         yield from super().without_effect()
-        for key in ("screening", "noise"):
-            if getattr(self, key) == "innovation":
-                yield f'{key} = "innovation"', 'take filter = "kalman"'
+        if self.noise == "innovation":
+            yield 'noise = "innovation"', 'take filter = "kalman"'
+        if self.screening == "innovation" and self.compose.robustness != "none":
+            yield 'screening = "innovation"', 'take compose.robustness = "none": both judge it'
 
     def unguarded(self, setting: Setting) -> Estimator:
         network, layout = setting.network, setting.layout
@@ -289,7 +293,9 @@ class PolarFilter(GridFilter):
         else:
             noise = of_grid(network, self.known_noise(setting), state_columns(network, layout))
         observation: Literal["ukf", "ekf"] = "ukf" if "points" in self.parts else "ekf"
-        return composition.build(self.name, observation, self.compose, network, layout, noise)
+        return composition.build(
+            self.name, observation, self.compose, network, layout, noise, self.refuse()
+        )
 
 
 _COMMON = tuple(

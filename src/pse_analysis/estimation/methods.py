@@ -163,8 +163,8 @@ class GridMethod(Method):
     Attributes
     ----------
     screening : {"none", "literal", "absolute", "scaled", "innovation"}
-        How gross errors are met: by an adaptive threshold before any filter, or, in a ``kalman``
-        filter, by its own innovation.
+        How gross errors are met: by an adaptive threshold before any method, or by a filter's own
+        innovation.
     adaptive_threshold : AdaptiveParams, optional
         Numbers of the threshold; its kind is that of ``screening``.
     """

@@ -294,7 +294,8 @@ def _channels(channels: pd.DataFrame, model: Model) -> pd.DataFrame:
             f"channels: sign of {row['channel']!r} must be 1, or -1 where the source counts "
             f"consumption as positive; received {shown(row['sign'])}"
         )
-    filled["sign"] = filled["sign"].astype(np.int8)
+    # Signs of no channel are not looked at above; the schema refuses such a table.
+    filled["sign"] = np.where([_is(sign, -1) for sign in filled["sign"]], -1, 1).astype(np.int8)
     return check_channels(filled.reset_index(drop=True), model)
 
 

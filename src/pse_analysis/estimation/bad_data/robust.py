@@ -20,7 +20,8 @@ from scipy.linalg import blas
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.bad_data.identification import Deletion
-from pse_analysis.estimation.core.cholesky import Root
+from pse_analysis.estimation.bad_data.innovation_test import Refuse
+from pse_analysis.estimation.core.cholesky import Root, cleaned
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -28,6 +29,8 @@ IntArray = npt.NDArray[np.int64]
 
 CONFIDENCE = 0.999
 """Share of snapshots without gross errors that pass the gate of a perfectly tuned filter."""
+FORGETTING = 1e8
+"""A measurement with a gross error η that is to be left out gets the noise of so many η²."""
 RAISE, MOST_RAISES = 4.0, 20
 """Factor by which φ is raised, and how often at most."""
 MARGIN = 9.0
@@ -197,6 +200,17 @@ def _confirmed_by_snapshot(heard: Deletion, error: FloatArray, price: float) -> 
     excluded = (standing.error - error) ** 2 > price * standing.variance
     acquitted = np.asarray(confirmed & excluded)
     return acquitted & (np.count_nonzero(acquitted) >= MIN_CONFIRMED)
+
+
+def left_out(refuse: Refuse) -> GrossErrorTest:
+    """Test that leaves out the measurements that an innovation test refuses."""
+
+    def judge(found: InnovationStats) -> FloatArray:
+        chol = cleaned(found.root.chol.copy())
+        refused = refuse(found.innovation, chol, np.sqrt(found.noise))
+        return np.where(refused, FORGETTING * found.innovation**2 / found.noise, 0.0)
+
+    return judge
 
 
 JUDGES: dict[str, GrossErrorTest] = {"none": none, "trace": trace, "per_channel": per_channel}

@@ -10,6 +10,7 @@ import numpy as np
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.bad_data import robust
+from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.bad_data.robust import Protection
 from pse_analysis.estimation.core.interface import Estimator
 from pse_analysis.estimation.filters import linearised, recursion, unscented
@@ -108,6 +109,7 @@ def compose(
     network: Network,
     layout: SensorLayout,
     voltages: VoltageNoise,
+    refuse: Refuse | None = None,
 ) -> recursion.GaussianFilter:
     """The filter of a composition.
 
@@ -119,6 +121,8 @@ def compose(
     layout : SensorLayout
     voltages : VoltageNoise
         Process noise of the estimated voltages, from which learning starts.
+    refuse : Refuse, optional
+        Innovation test that stands in the place of a robustness.
 
     Returns
     -------
@@ -140,15 +144,14 @@ def compose(
             "likelihood": unscented.by_likelihood,
         }[composition.scaling]
         observation = scaled(model, composition.points, composition.form)
+    judge = robust.JUDGES[composition.robustness] if refuse is None else robust.left_out(refuse)
     judges = composition.robustness != "none" and composition.protected
     return recursion.GaussianFilter(
         model,
         process,
         observation,
         made,
-        recursion.Robustness(
-            robust.JUDGES[composition.robustness], composition.protection if judges else None
-        ),
+        recursion.Robustness(judge, composition.protection if judges else None),
     )
 
 
@@ -159,9 +162,10 @@ def build(
     network: Network,
     layout: SensorLayout,
     voltages: VoltageNoise,
+    refuse: Refuse | None = None,
 ) -> Estimator:
     """Estimator of a composition, started from weighted least squares."""
-    made = compose(kind, composition, network, layout, voltages)
+    made = compose(kind, composition, network, layout, voltages, refuse)
     return recursion.estimator(name, network, layout, made)
 
 

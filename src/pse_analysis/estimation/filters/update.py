@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pse_analysis.estimation.bad_data.identification import Deletion, of_snapshot
-from pse_analysis.estimation.bad_data.robust import GrossErrorTest, InnovationStats
+from pse_analysis.estimation.bad_data.robust import FORGETTING, GrossErrorTest, InnovationStats
 from pse_analysis.estimation.core.interface import Info, Snapshot
 from pse_analysis.estimation.filters.conditioning import Posterior, Predicted, Prior
 from pse_analysis.estimation.filters.restart import gross_errors
@@ -27,8 +27,6 @@ Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Predicted]
 Remainder = Callable[[Prior, IntArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """(prior, rows, s of the expansion, s that it led to, σ of the rows) -> what was left out (r,)."""
 
-FORGETTING = 1e8
-"""A gross error η gets the noise of so many η²."""
 TOLERANCE = 1e-6
 """Largest move of a voltage in the last pass of an iterated filter. [rad, p.u.]"""
 
