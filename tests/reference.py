@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, FROM, IA, IM, TO, VA, VM, P, Q, SensorLayout
 
@@ -42,6 +43,24 @@ def every_quantity(network: Network) -> SensorLayout:
     rows += [(q, branch, side) for q in (P, Q) for side in (FROM, TO)]
     rows += [(q, closed, side) for q in (IM, IA) for side in (FROM, TO)]
     return SensorLayout.of(network, *rows)
+
+
+def conventional(network: Network) -> SensorLayout:
+    """Voltages, injections and flows, without any angle."""
+    bus = np.arange(network.n_bus)
+    branch = np.flatnonzero(network.branches.in_service)
+    rows = [(VM, bus, BUS), (P, bus, BUS), (Q, bus, BUS), (P, branch, FROM), (Q, branch, TO)]
+    return SensorLayout.of(network, *rows)
+
+
+def snapshot(
+    z: np.ndarray, sigma: np.ndarray, available: np.ndarray | None = None, step: int = 0
+) -> Snapshot:
+    """Snapshot of fresh samples, five minutes after the one before."""
+    rows = np.ones(len(z), dtype=bool) if available is None else available
+    zero = np.zeros(len(z))
+    time = np.datetime64("2016-06-09T00:00:00", "us") + step * np.timedelta64(300, "s")
+    return Snapshot(time, np.where(rows, z, 0.0), sigma, zero, rows, rows, zero)
 
 
 def measured(network: Network, layout: SensorLayout, x: np.ndarray) -> np.ndarray:

@@ -134,11 +134,22 @@ def test_instant_without_any_sample_has_its_row_too(method: Method) -> None:
         assert grown.all()
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
-def test_snapshot_that_is_not_observable_is_flagged_and_the_run_goes_on(method: Method) -> None:
+def test_least_squares_estimate_what_few_measurements_tell_and_leave_the_rest_open() -> None:
     table = telemetry(6)
     few = (table["time_utc"] < instant(2)) & ~table["channel"].str.endswith("vm_pu")
-    got = estimate(table[~few], CHANNELS, NETWORK, study(6), method)
+    got = estimate(table[~few], CHANNELS, NETWORK, study(6), METHODS[0])
+    assert got.steps["status"].tolist() == ["partly_observable"] * 2 + ["ok"] * 4
+    late = got.estimated["time_utc"] >= instant(2)
+    angle = got.estimated["quantity"] == "va_degree"
+    slack = got.estimated["element"] == f"bus/{NETWORK.buses.name[NETWORK.slack]}"
+    for column in ("value", "sigma"):
+        assert got.estimated[column].notna().equals(late | ~angle | slack)
+
+
+def test_filter_whose_start_is_not_observable_waits_for_one_that_is() -> None:
+    table = telemetry(6)
+    few = (table["time_utc"] < instant(2)) & ~table["channel"].str.endswith("vm_pu")
+    got = estimate(table[~few], CHANNELS, NETWORK, study(6), METHODS[1])
     assert got.steps["status"].tolist() == ["unobservable"] * 2 + ["ok"] * 4
     late = got.estimated["time_utc"] >= instant(2)
     assert got.estimated["value"].notna().equals(late)
@@ -270,6 +281,45 @@ def test_nees_folds_angles_and_leaves_out_what_is_fixed() -> None:
     )
     got = run(one, iter(snapshots(1)), NETWORK, LAYOUT, truth=TRUTH[None, :])
     assert got.steps["nees"].iloc[0] == pytest.approx(1.0 + 4.0)
+
+
+@pytest.mark.parametrize(("variance", "status"), [(-1e-6, "diverged"), (-1e-18, "ok")])
+def test_negative_variance_is_no_estimate_but_for_the_rounding_of_a_fixed_state(
+    variance: float, status: str
+) -> None:
+    m, covariance = len(LAYOUT), 1e-4 * np.eye(28)
+    covariance[3, 3] = variance
+    one = Estimator(
+        "wrong",
+        lambda s: (0, Info.nothing(m, Status.OK)),
+        lambda state, s: (state, Info.nothing(m, Status.OK)),
+        lambda state: Voltages(TRUTH, covariance),
+    )
+    got = run(one, iter(snapshots(2)), NETWORK, LAYOUT, truth=np.tile(TRUTH, (2, 1)))
+    assert got.steps["status"].tolist() == [status] * 2
+    assert got.estimated["value"].notna().all() == (status == "ok")
+    if status == "ok":
+        assert got.estimated["sigma"].min() == 0.0
+        assert got.steps["nees"].tolist() == [0.0] * 2
+
+
+def test_open_states_are_missing_in_the_table_and_do_not_count_as_errors() -> None:
+    m, covariance = len(LAYOUT), 1e-4 * np.eye(28)
+    x, open_ = TRUTH.copy(), np.zeros(28, dtype=bool)
+    x[5] += 0.02
+    open_[[4, 18]] = True
+    x[open_] = np.nan
+    covariance[open_], covariance[:, open_] = np.nan, np.nan
+    one = Estimator(
+        "partial",
+        lambda s: (0, Info.nothing(m, Status.PARTLY_OBSERVABLE)),
+        lambda state, s: (state, Info.nothing(m, Status.PARTLY_OBSERVABLE)),
+        lambda state: Voltages(x, covariance, open_),
+    )
+    got = run(one, iter(snapshots(1)), NETWORK, LAYOUT, truth=TRUTH[None, :])
+    for column in ("value", "sigma"):
+        np.testing.assert_array_equal(got.estimated[column].isna(), open_)
+    assert got.steps["nees"].iloc[0] == pytest.approx(4.0)
 
 
 def test_no_snapshot_gives_empty_tables() -> None:

@@ -71,7 +71,8 @@ CONTEXTS: tuple[dict[str, Any], ...] = (
 OTHERS: dict[str, tuple[Any, ...]] = {
     "variance": (1e-3,),
     "source_sigma": (0.02,),
-    "tolerance": (0.05,),
+    "tolerance": (0.01,),
+    "confidence": (0.51, 0.999999),
     "max_iterations": (1,),
     "window": (3.0, 9),
     "slot_s": (7200.0,),
@@ -257,7 +258,7 @@ def test_every_key_changes_the_estimate_or_is_refused(context: dict[str, Any]) -
         ),
         ({"filter": "lstm"}, "filter must be one of 'wls', .*'observer'.*entry point"),
         ({"filter": 3}, "'filter' is missing"),
-        ({"filter": "wls", "tolerance": 0.0}, "expected tolerance in 0 … 0.1"),
+        ({"filter": "wls", "tolerance": 0.0}, "expected 0 < tolerance ≤ 0.01"),
         ({"filter": "kalman", "history": {"slot_s": 1.0}}, "expected slot_s in 60"),
     ],
 )

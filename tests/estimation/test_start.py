@@ -6,6 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from qu_bench import Bench, gross_errors, still
 
 from pse_analysis.errors import Unobservable
@@ -117,3 +119,21 @@ def test_spoilt_first_snapshot_does_not_spoil_the_filter(kind: str) -> None:
     assert set(first["channel"]) == {b.layout.channel[i] for i in wrong}
     assert (first["reasons"] == Reason.INNOVATION).all()
     assert tables.steps["rejected"].iloc[0] == 2
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10**6), decades=st.integers(2, 9))
+def test_sigma_of_many_decades_and_huge_errors_end_in_an_estimate_or_none(
+    seed: int, decades: int
+) -> None:
+    b, wls = least_squares("ieee14")
+    rng, m = np.random.default_rng(seed), len(b.layout)
+    sigma = 10.0 ** rng.uniform(-decades, 0.0, m)
+    z = b.exact[0] + sigma * rng.normal(size=m)
+    wrong = rng.choice(m, 3, replace=False)
+    z[wrong] += 10.0 ** rng.uniform(0.0, 6.0, 3)
+    solution, left_out = robust_wls(wls, z, sigma, np.ones(m, dtype=bool))
+    assert left_out.shape == (m,)
+    if solution.converged:
+        assert np.isfinite(solution.x).all()
+        assert (np.diagonal(solution.covariance()) >= 0.0).all()

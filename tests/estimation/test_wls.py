@@ -8,21 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import GRIDS, every_quantity, measured
+from reference import GRIDS, conventional, every_quantity, measured, snapshot
 
 from pse_analysis.errors import Unobservable
-from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.estimation.static.tracking import tracking_wls
 from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import library
-from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import (
     BUS,
     FROM,
     IA,
     IM,
-    TO,
     VA,
     VM,
     MeasurementModel,
@@ -33,23 +30,6 @@ from pse_analysis.measurement import (
 from pse_analysis.vocabulary import Status
 
 SEED = 14
-
-
-def conventional(network: Network) -> SensorLayout:
-    """Voltages, injections and flows, without any angle."""
-    bus = np.arange(network.n_bus)
-    branch = np.flatnonzero(network.branches.in_service)
-    rows = [(VM, bus, BUS), (P, bus, BUS), (Q, bus, BUS), (P, branch, FROM), (Q, branch, TO)]
-    return SensorLayout.of(network, *rows)
-
-
-def snapshot(
-    z: np.ndarray, sigma: np.ndarray, available: np.ndarray | None = None, step: int = 0
-) -> Snapshot:
-    rows = np.ones(len(z), dtype=bool) if available is None else available
-    zero = np.zeros(len(z))
-    time = np.datetime64("2016-06-09T00:00:00", "us") + step * np.timedelta64(300, "s")
-    return Snapshot(time, np.where(rows, z, 0.0), sigma, zero, rows, rows, zero)
 
 
 @pytest.mark.parametrize("grid", GRIDS)

@@ -20,7 +20,7 @@ from pse_analysis.estimation.process import covariance_matching, learn_from_hist
 from pse_analysis.estimation.process.covariance_matching import CovarianceMatching
 from pse_analysis.estimation.process.load_noise import ProcessNoise
 from pse_analysis.estimation.process.sage_husa import VoltageNoise, of_grid
-from pse_analysis.estimation.static.tracking import tracking_wls
+from pse_analysis.estimation.static.tracking import WlsParams, tracking_wls
 from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.machine import Machine
 from pse_analysis.measurement.rectangular import Linearisation
@@ -61,21 +61,22 @@ class LeastSquares(GridMethod):
 
     Attributes
     ----------
-    tolerance : float
-        Largest step of a converged state. [rad, p.u.]
-    max_iterations : int
+    confidence, tolerance, max_iterations
+        As for `pse_analysis.estimation.static.tracking.WlsParams`.
     """
 
-    tolerance: float = 1e-8
-    max_iterations: int = 25
+    confidence: float = WlsParams.confidence
+    tolerance: float = WlsParams.tolerance
+    max_iterations: int = WlsParams.max_iterations
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (0 < self.tolerance <= 0.1 and 1 <= self.max_iterations <= 10_000):
-            raise ParameterError(
-                f"[estimate.methods] {self.name!r}: expected tolerance in 0 … 0.1 and "
-                f"max_iterations in 1 … 10000, received {self.tolerance} and {self.max_iterations}"
-            )
+        _ = self.numbers
+
+    @property
+    def numbers(self) -> WlsParams:
+        """Numbers of the estimator."""
+        return WlsParams(self.confidence, self.tolerance, self.max_iterations)
 
     def without_effect(self) -> Iterator[tuple[str, str]]:
         yield from super().without_effect()
@@ -83,13 +84,7 @@ class LeastSquares(GridMethod):
             yield 'screening = "innovation"', 'take filter = "kalman", "ukf" or "ekf"'
 
     def unscreened(self, setting: Setting) -> Estimator:
-        return tracking_wls(
-            self.name,
-            setting.network,
-            setting.layout,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-        )
+        return tracking_wls(self.name, setting.network, setting.layout, self.numbers)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,8 +49,8 @@ def references(network: Network) -> IntArray:
 def resting_angles(network: Network) -> FloatArray:
     """Returns the angles without load, which phase shifters turn. (n_bus,) [rad]
 
-    They count from the reference of each island, along one tree of branches in service; around a
-    loop shifts may disagree.
+    They count from the reference of each island, along one tree of branches in service, and are
+    folded into [-π, π); around a loop shifts may disagree.
     """
     branch = network.branches
     angle = np.zeros(network.n_bus)
@@ -66,4 +66,4 @@ def resting_angles(network: Network) -> FloatArray:
         order, before = sparse.csgraph.breadth_first_order(linked, root, directed=False)
         for bus in order[1:]:
             angle[bus] = angle[before[bus]] + shift[int(before[bus]), int(bus)]
-    return angle
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

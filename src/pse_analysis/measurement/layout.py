@@ -170,6 +170,15 @@ class SensorLayout:
             columns[name] = tuple(map(str, columns[name]))
         return SensorLayout(**columns)
 
+    def joined(self, other: SensorLayout) -> SensorLayout:
+        """The layout with the rows of another one after its own."""
+        columns: dict[str, Any] = {}
+        for f in fields(self):
+            mine, theirs = getattr(self, f.name), getattr(other, f.name)
+            together = mine + theirs if isinstance(mine, tuple) else np.concatenate([mine, theirs])
+            columns[f.name] = together
+        return SensorLayout(**columns)
+
     @cached_property
     def angular(self) -> npt.NDArray[np.bool_]:
         """Rows that are angles of voltages or currents, whose differences must be folded. (m,)"""

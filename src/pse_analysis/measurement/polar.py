@@ -24,6 +24,9 @@ from pse_analysis.measurement.layout import (
     wrap,
 )
 
+VANISHED = 1e-10
+"""Current, in units of the sum of its terms, whose direction is next to nothing but rounding."""
+
 
 class MeasurementModel:
     """h(x) and its sparse Jacobian in polar coordinates, for a fixed layout.
@@ -48,12 +51,48 @@ class MeasurementModel:
         self.columns = np.arange(n2) if columns is None else np.asarray(columns, dtype=np.int64)
         self._terminals = Terminals(network, layout)
         self._rows = {q: np.flatnonzero(layout.quantity == q) for q in range(6)}
+        self._gross = np.asarray(abs(self._terminals.y).sum(axis=1)).ravel()
         self._compile()
 
     @property
     def shape(self) -> tuple[int, int]:
         """(m, n) of the Jacobian."""
         return len(self.layout), len(self.columns)
+
+    @cached_property
+    def gross(self) -> FloatArray:
+        """Sum of the sizes of the terms of h(x) at rated voltage. (m,)"""
+        terminal = self._terminals.of_row
+        return np.where(terminal >= 0, np.append(self._gross, 1.0)[terminal], 1.0)
+
+    @cached_property
+    def _currents(self) -> tuple[IntArray, sparse.csr_array, FloatArray]:
+        """Rows of currents, the admittances that give them, and the least that is not rounding."""
+        rows = np.concatenate([self._rows[IM], self._rows[IA]])
+        terminal = self._terminals.of_row[rows]
+        return rows, self._terminals.y[terminal], VANISHED * self._gross[terminal]
+
+    def without_tangent(self, x: FloatArray) -> npt.NDArray[np.bool_] | None:
+        """Rows of currents that vanish at a state, so that they have no derivative there.
+
+        Parameters
+        ----------
+        x : (2N,) ndarray
+
+        Returns
+        -------
+        (m,) ndarray of bool or None
+            None if there is no such row.
+        """
+        rows, admittance, least = self._currents
+        if not len(rows):
+            return None
+        vanished = np.abs(admittance @ self._voltage(x)) <= least
+        if not vanished.any():
+            return None
+        out = np.zeros(len(self.layout), dtype=np.bool_)
+        out[rows] = vanished
+        return out
 
     def _compile(self) -> None:
         n = self.network.n_bus
@@ -161,8 +200,9 @@ class MeasurementModel:
         if len(self._entries[IM]) or len(self._entries[IA]):
             size = np.abs(current)
             # |I| has no derivative at I = 0 and ∠I no value: such rows get zeros and so no weight.
+            least = VANISHED * self._gross.reshape(-1, *([1] * len(points)))
             inverse = np.divide(
-                current.conj(), size**2, out=np.zeros_like(current), where=size > 1e-12
+                current.conj(), size**2, out=np.zeros_like(current), where=size > least
             )
             relative = part * inverse[t.entry_row]  # d(log I)/d(log V_k)
             size = size[t.entry_row]

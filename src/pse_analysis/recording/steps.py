@@ -8,7 +8,7 @@ import rerun as rr
 from pse_analysis.drawing import GREEN, GREY, ORANGE, SOURCES, VERMILION
 from pse_analysis.recording import marks
 
-_STATUS = {"ok": GREEN, "predicted": GREY, "restarted": ORANGE}
+_STATUS = {"ok": GREEN, "predicted": GREY, "restarted": ORANGE, "partly_observable": ORANGE}
 
 
 def draw_statuses(stream: rr.RecordingStream, steps: pd.DataFrame) -> None:

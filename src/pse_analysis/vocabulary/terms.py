@@ -82,6 +82,7 @@ class Status(enum.StrEnum):
     INCONSISTENT = "inconsistent"
     NOT_CONVERGED = "not_converged"
     UNOBSERVABLE = "unobservable"
+    PARTLY_OBSERVABLE = "partly_observable"
     DIVERGED = "diverged"
     RESTARTED = "restarted"
 

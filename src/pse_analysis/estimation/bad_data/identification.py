@@ -260,20 +260,20 @@ class _Rest:
 
     def ratio(self, out: IntArray, floor: FloatArray) -> FloatArray:
         """`DeletionResiduals.ratio` of the kept ones, zero for the left-out and critical ones."""
-        ratio = self.weighted**2 / np.maximum(self.diagonal, floor)
-        ratio[out] = 0.0
-        ratio[self.diagonal <= floor] = 0.0
-        return np.asarray(ratio)
+        kept = self.diagonal > floor
+        kept[out] = False
+        ratio = np.zeros(len(kept))
+        np.divide(self.weighted**2, self.diagonal, out=ratio, where=kept)
+        return ratio
 
 
 def _factor(matrix: FloatArray) -> FloatArray:
     """Lower Cholesky factor of a small precision."""
-    factor, failed = lapack.dpotrf(matrix, lower=1)
-    if failed:
-        factor, failed = lapack.dpotrf(matrix + np.diag(JITTER * np.diagonal(matrix)), lower=1)
-    if failed:
-        raise np.linalg.LinAlgError("a precision is not positive definite")
-    return np.asarray(factor)
+    for share in (0.0, JITTER, 1e3 * JITTER, 1e6 * JITTER):
+        factor, failed = lapack.dpotrf(matrix + np.diag(share * np.diagonal(matrix)), lower=1)
+        if not failed:
+            return np.asarray(factor)
+    raise np.linalg.LinAlgError("a precision is not positive definite")
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
@@ -316,6 +316,11 @@ def of_snapshot(
     Deletion
         Of the k rows. Its M = R⁻¹ - R⁻¹H G⁻¹HᵀR⁻¹ knows each voltage to `PRIOR_SIGMA_PU` around
         x, which keeps G regular whatever is left out, and says next to nothing.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If σ differ by more than working precision can tell apart.
     """
     m, n = model.shape
     root, white = np.zeros(m), np.zeros(m)
@@ -325,7 +330,9 @@ def of_snapshot(
     gain = model.gram(whitened)
     gain.reshape(-1, order="A")[:: n + 1] += PRIOR_SIGMA_PU**-2
     # Dense from here: sparse factors cost more in their making for a few hundred rows.
-    factor, _ = lapack.dpotrf(gain, lower=1, clean=0, overwrite_a=1)
+    factor, failed = lapack.dpotrf(gain, lower=1, clean=0, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("the gain is not positive definite to working precision")
     place = np.full(m, -1)
     place[rows[among]] = np.arange(len(among))
     at = place[model.row_of_entry]

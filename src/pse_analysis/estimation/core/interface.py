@@ -91,6 +91,9 @@ class Info:
     reasons : (m,) ndarray of int, optional
         Bits of `Reason` for what a screening decided; without it an inflated row is
         `Reason.INNOVATION`.
+    tested : bool
+        The status already says whether ``nis`` is as large as it should be, so that nobody tests it
+        again.
 
     Rows with an innovation that were not used were refused.
     """
@@ -105,6 +108,7 @@ class Info:
     inflation: FloatArray
     detail: str = ""
     reasons: npt.NDArray[np.int32] | None = None
+    tested: bool = False
 
     @property
     def judged(self) -> BoolArray:
@@ -127,11 +131,13 @@ class Info:
 class Estimate(NamedTuple):
     """Estimate x (n,) with its covariance (n, n); what the entries are follows from the model.
 
-    A grid's are [θ; |V|] (2N,) [rad, p.u.], a machine's [θ; ω] (2,) [rad, rad/s].
+    A grid's are [θ; |V|] (2N,) [rad, p.u.], a machine's [θ; ω] (2,) [rad, rad/s]. States that the
+    measurements leave open are NaN, in both.
     """
 
     x: FloatArray
     covariance: FloatArray
+    open: BoolArray | None = None
 
 
 Voltages = Estimate

@@ -21,6 +21,8 @@ from pse_analysis.vocabulary import Status
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
+JITTER = 1e-10
+"""Share of the largest variance that rounding may take from one that is zero."""
 CONSISTENCY_STEPS = 12
 """Steps over which NIS is summed before a filter is called inconsistent."""
 CONSISTENCY_RATIO = (0.5, 2.0)
@@ -108,12 +110,9 @@ class _Trace:
         self.time.append(time)
         self.info.append(info)
         self.seconds.append(seconds)
-        self.x.append(nothing if estimate is None else estimate.x)
-        self.sigma.append(
-            nothing
-            if estimate is None
-            else np.sqrt(np.maximum(np.diagonal(estimate.covariance), 0.0))
-        )
+        deviation = None if estimate is None else _deviation(estimate)
+        self.x.append(nothing if estimate is None or deviation is None else estimate.x)
+        self.sigma.append(nothing if deviation is None else deviation)
         self.nees.append(_nees(estimate, truth, states.folded))
 
 
@@ -152,12 +151,12 @@ def run(
         begun = time.perf_counter()
         state, info, estimate = _outlived(estimator, state, snapshot, len(layout))
         seconds = time.perf_counter() - begun
-        if estimate is not None and not (
-            np.isfinite(estimate.x).all() and np.isfinite(np.diagonal(estimate.covariance)).all()
-        ):
+        if estimate is not None and _deviation(estimate) is None:
             estimate, state = None, None
             info = Info.nothing(
-                len(layout), Status.DIVERGED, "the state is not finite: it restarts next instant"
+                len(layout),
+                Status.DIVERGED,
+                "the state is not finite, or a variance is negative: it restarts next instant",
             )
         trace.add(
             snapshot.time, info, seconds, estimate, None if truth is None else truth[k], states
@@ -214,12 +213,26 @@ def _outlived(
         return None, Info.nothing(m, Status.DIVERGED, why), None
 
 
+def _deviation(estimate: Estimate) -> FloatArray | None:
+    """Returns σ of an estimate, NaN where it is open; None where it is no estimate at all."""
+    variance = np.diagonal(estimate.covariance).copy()
+    known = np.ones(len(variance), dtype=bool) if estimate.open is None else ~estimate.open
+    if not (np.isfinite(estimate.x[known]).all() and np.isfinite(variance[known]).all()):
+        return None
+    # A fixed angle has no variance, of which rounding may leave either sign.
+    slight = JITTER * variance[known].max(initial=0.0)
+    if (variance[known] < -slight).any():
+        return None
+    variance[known] = np.maximum(variance[known], 0.0)
+    return np.sqrt(variance)
+
+
 def _nees(estimate: Estimate | None, truth: FloatArray | None, folded: BoolArray) -> float:
     if estimate is None or truth is None or not np.isfinite(truth).all():
         return float("nan")
     error = estimate.x - truth
     error[folded] = wrap(error[folded])
-    deviation = np.sqrt(np.diagonal(estimate.covariance))
+    deviation = np.sqrt(np.maximum(np.diagonal(estimate.covariance), 0.0))
     free = deviation > 1e-12
     scaled = estimate.covariance[np.ix_(free, free)] / np.outer(deviation[free], deviation[free])
     try:
@@ -259,7 +272,7 @@ def _tables(
     nis = np.array([i.nis for i in trace.info])
     dof = np.array([i.dof for i in trace.info], dtype=np.int64)
     status = [
-        Status.INCONSISTENT if i.status is Status.OK and not good else i.status
+        Status.INCONSISTENT if i.status is Status.OK and not (good or i.tested) else i.status
         for i, good in zip(trace.info, _consistent(nis, dof), strict=True)
     ]
     used = np.array([i.used for i in trace.info]).reshape(count, len(layout))

@@ -306,7 +306,7 @@ def _explained_voltage(history: Record, layout: SensorLayout, network: Network) 
     """
     n = network.n_bus
     sensitivity = Sensitivity(network)
-    flow = solve(network)
+    flow = solve(network, own_references=True)
     voltage = flow.vm * np.exp(1j * flow.theta)
     by_input = np.zeros((n, 2 * n))
     by_input[:, sensitivity.inputs] = (to_polar(voltage) @ sensitivity.at(voltage)[0])[n:]

@@ -97,10 +97,13 @@ class Sensitivity:
         self._network = network
         n, kind = network.n_bus, network.buses.kind
         self.slack = network.slack
-        angle = np.flatnonzero(np.arange(n) != network.slack)
-        self._pq = np.flatnonzero(kind == BusKind.PQ)
-        self._pv = np.flatnonzero(kind == BusKind.PV)
-        self.held = np.flatnonzero(kind != BusKind.PQ)
+        # Every island has a bus that holds its voltage and its angle.
+        reference = np.zeros(n, dtype=bool)
+        reference[network.references] = True
+        angle = np.flatnonzero(~reference)
+        self._pq = np.flatnonzero((kind == BusKind.PQ) & ~reference)
+        self._pv = np.flatnonzero((kind == BusKind.PV) & ~reference)
+        self.held = np.flatnonzero((kind != BusKind.PQ) | reference)
         self.inputs = np.concatenate([angle, n + self._pq])  # rows of [P; Q] that are given
         self._admittance = np.asarray(network.y_bus.toarray().conj())
 
@@ -116,7 +119,7 @@ class Sensitivity:
         Raises
         ------
         NotConverged
-            If the power flow is singular there, as where a part of the grid is cut off.
+            If the power flow is singular there.
         """
         n, pq, pv, held = len(voltage), self._pq, self._pv, self.held
         carried = voltage[:, None] * self._admittance
@@ -138,13 +141,9 @@ class Sensitivity:
         right = np.concatenate([np.eye(len(self.inputs)), -grown], axis=1)
         _, _, solved, singular = lapack.dgesv(unknown, right, overwrite_a=1, overwrite_b=1)
         if singular:
-            island = self._network.islands()
-            apart = np.flatnonzero(island != island[self._network.slack])
-            names = ", ".join(self._network.buses.name[i] for i in apart[:5])
-            why = f": no path leads from the slack bus to {names}" if len(apart) else ""
             raise NotConverged(
-                f"the power flow of {self._network.name} is singular at this voltage{why}; close a "
-                'branch, drop the buses that are cut off, or use noise = "scalar"'
+                f"the power flow of {self._network.name} is singular at this voltage: give "
+                'noise = "scalar"'
             )
         moved = np.zeros((2 * n, right.shape[1]))
         moved[pq], moved[n + pq] = solved[: len(pq)], solved[len(pq) : 2 * len(pq)]

@@ -11,8 +11,8 @@ from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.bad_data.identification import of_snapshot
 from pse_analysis.estimation.bad_data.robust import FAR, gate
 from pse_analysis.estimation.core.interface import Info, Snapshot
+from pse_analysis.estimation.static.plausibility import implausible
 from pse_analysis.estimation.static.wls import WeightedLeastSquares, WlsSolution
-from pse_analysis.measurement import wrap
 from pse_analysis.vocabulary import Reason, Status
 
 FloatArray = npt.NDArray[np.float64]
@@ -56,8 +56,7 @@ def robust_wls(
     """
     left_out = np.zeros(len(z), dtype=bool)
     solution = wls.solve(z, sigma, available)
-    # A reference that stands for silent angles counts as one measurement.
-    freedom = int(available.sum()) + int(solution.pinned) - wls.model.shape[1]
+    freedom = solution.dof
     if freedom <= 0:
         return solution, left_out
     if solution.converged and solution.objective <= gate(freedom)[0]:
@@ -76,7 +75,7 @@ def robust_wls(
         if not solution.converged or (left_out == before).all():
             break
         x = solution.x
-    if not _credible(wls, solution.x):
+    if implausible(wls.network, solution.x):
         solution = replace(solution, converged=False)
     residual = np.where(available, wls.model.residual(z, solution.x), np.nan)
     return replace(solution, residual=residual), left_out
@@ -94,10 +93,15 @@ def _contradicting(
     rows = np.flatnonzero(available)
     residual, noise = wls.model.residual(z, x)[rows], sigma[rows] ** 2
     every = np.arange(len(rows))
-    deletion = of_snapshot(wls.model, x, rows, residual, noise, every)
-    found = np.flatnonzero(deletion.search(start[rows], gate(len(rows))[1]))
     out, unseen = np.zeros(len(z), dtype=bool), np.zeros(len(z))
-    out[rows[found]], unseen[rows[found]] = True, deletion.error_estimate(found)[1] / noise[found]
+    try:
+        deletion = of_snapshot(wls.model, x, rows, residual, noise, every)
+        found = np.flatnonzero(deletion.search(start[rows], gate(len(rows))[1]))
+        seen = deletion.error_estimate(found)[1]
+    except np.linalg.LinAlgError:
+        # Rounding hides which of them contradict each other: what was left out stays so.
+        return start, unseen
+    out[rows[found]], unseen[rows[found]] = True, seen / noise[found]
     return out, unseen
 
 
@@ -119,15 +123,6 @@ def _solve_rest(
             if not out.any():
                 raise
             out[int(np.where(out, unseen, -np.inf).argmax())] = False
-
-
-def _credible(wls: WeightedLeastSquares, x: FloatArray) -> bool:
-    """Whether voltages are between half and one and a half, and branches are statically stable."""
-    network = wls.network
-    n, branches = network.n_bus, network.branches
-    across = wrap(x[branches.from_bus] - x[branches.to_bus] - branches.shift_rad)
-    steep = branches.in_service & (np.abs(across) > 0.5 * np.pi)
-    return not steep.any() and bool((np.abs(x[n:] - 1.0) < 0.5).all())
 
 
 def begin(wls: WeightedLeastSquares, snapshot: Snapshot) -> tuple[WlsSolution | None, Info]:
