@@ -168,7 +168,8 @@ class Dynamics(NamedTuple):
     Attributes
     ----------
     belief : state -> (s (N,), P (N, N))
-    predict : (state, time) -> Transition
+    predict : (state, snapshot) -> Transition
+        To the instant of a snapshot, before its measurements are read.
     read : (state, s, P) -> Estimate
         Estimate of a mean and covariance that stand in the place of the state's own.
     difference : (s, s) -> (N,) ndarray
@@ -176,7 +177,7 @@ class Dynamics(NamedTuple):
     """
 
     belief: Callable[[Any], tuple[FloatArray, FloatArray]]
-    predict: Callable[[Any, np.datetime64], Transition]
+    predict: Callable[[Any, Snapshot], Transition]
     read: Callable[[Any, FloatArray, FloatArray], Estimate]
     difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract
 
@@ -184,7 +185,7 @@ class Dynamics(NamedTuple):
         """The same for a state that holds the filter's own among other things."""
         return Dynamics(
             lambda state: self.belief(unwrap(state)),
-            lambda state, time: self.predict(unwrap(state), time),
+            lambda state, snapshot: self.predict(unwrap(state), snapshot),
             lambda state, s, P: self.read(unwrap(state), s, P),
             self.difference,
         )

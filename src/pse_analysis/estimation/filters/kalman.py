@@ -198,10 +198,10 @@ class KalmanFilter:
         noise = self.lagged.process.noise(walk)
         return self.lagged.moved(belief, forecast, noise), noise, shapes
 
-    def predict(self, state: KalmanState, time: np.datetime64) -> Transition:
-        """How the state moves to a later instant without measurements there."""
+    def predict(self, state: KalmanState, snapshot: Snapshot) -> Transition:
+        """How the state moves to the instant of a snapshot, before that is read."""
         belief = Belief(state.x, state.P, state.process)
-        prior, _, _ = self._moved(belief, state.noise, time)
+        prior, _, _ = self._moved(belief, state.noise, snapshot.time)
         return Transition(prior.x, prior.P, self.lagged.cross(belief))
 
     def estimate(self, x: FloatArray, P: FloatArray) -> Voltages:

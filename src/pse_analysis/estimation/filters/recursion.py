@@ -219,9 +219,9 @@ class GaussianFilter:
         x[columns] = s[: len(columns)]
         return Prior(s, forecast + covariance, x, columns, root), moved
 
-    def predict(self, state: GaussianState, time: np.datetime64) -> Transition:
-        """How the state moves to a later instant without measurements there."""
-        prior, _ = self._moved(state, time)
+    def predict(self, state: GaussianState, snapshot: Snapshot) -> Transition:
+        """How the state moves to the instant of a snapshot, before that is read."""
+        prior, _ = self._moved(state, snapshot.time)
         return Transition(prior.s, prior.P, _through(self.process.transition, state.P).T)
 
     def difference(self, one: FloatArray, other: FloatArray) -> FloatArray:

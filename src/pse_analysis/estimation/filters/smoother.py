@@ -111,7 +111,7 @@ class Trail:
         follows = follows and info.status is not Status.RESTARTED
         if follows:
             dynamics = _dynamics(self.estimator)
-            ahead = dynamics.predict(self._before, self.snapshots[k].time).covariance
+            ahead = dynamics.predict(self._before, self.snapshots[k]).covariance
             after = dynamics.belief(state)[1]
             follows = len(ahead) == len(after) and bool(
                 (np.diagonal(after) <= WIDENED * np.diagonal(ahead)).all()
@@ -148,7 +148,7 @@ class Trail:
                 if later is None or not self._follows[k + 1]:
                     later = Smoothed(*belief)
                 else:
-                    transition = dynamics.predict(state, self.snapshots[k + 1].time)
+                    transition = dynamics.predict(state, self.snapshots[k + 1])
                     later = look_back(belief, transition, later, dynamics.difference)
                 out[k] = dynamics.read(state, later.s, later.P)
             last = first - 1
