@@ -10,10 +10,10 @@ from reference import conventional, snapshot
 from scipy import stats
 
 from pse_analysis.errors import ParameterError
-from pse_analysis.estimation import Method, WlsParams
+from pse_analysis.estimation import LeastSquares, Method
 from pse_analysis.estimation.core.interface import Info
 from pse_analysis.estimation.static.chi_square import Residuals, contradiction
-from pse_analysis.estimation.static.tracking import tracking_wls
+from pse_analysis.estimation.static.tracking import WlsParams, tracking_wls
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
@@ -155,10 +155,11 @@ def test_confidence_of_a_case_file_reaches_the_test_and_other_filters_refuse_it(
     z[0] += 2.65 * np.sqrt(2.0) * sigma[0]
     assert of_snapshot(network, layout, z, sigma, 0.99).status == "ok"
     assert of_snapshot(network, layout, z, sigma, 0.95).status == "inconsistent"
-    lax = WlsParams(confidence=0.9)
-    assert Method("wls", "wls", least_squares=lax).least_squares.confidence == 0.9
-    with pytest.raises(ParameterError, match=r"least_squares = \{ … \} is for wls"):
-        Method("ukf", "ukf", least_squares=lax)
+    lax = Method.of("wls", "wls", confidence=0.9)
+    assert isinstance(lax, LeastSquares)
+    assert lax.numbers.confidence == 0.9
+    with pytest.raises(ParameterError, match="confidence has no effect with filter = 'ukf'"):
+        Method.of("ukf", "ukf", confidence=0.9)
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,8 @@ def test_low_voltage_is_one_if_its_meter_confirms_it() -> None:
     state, _ = guard.init(b.snapshot(b.exact[0]))
     x = state.inner.x.copy()
     x[b.network.n_bus + 4] = 0.2
-    low, z = dataclasses.replace(state.inner, x=x), b.exact[0].copy()
+    s = x[guard.inner.step.__self__.model.columns]
+    low, z = dataclasses.replace(state.inner, x=x, s=s), b.exact[0].copy()
     assert "0.2 p.u. at bus number 4" in guard.impossible(low, b.snapshot(z))
     meter = (b.layout.quantity == VM) & (b.layout.position == 4)
     z[meter] = 0.22
