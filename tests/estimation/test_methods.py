@@ -32,6 +32,7 @@ from pse_analysis.estimation import (
     estimate,
     variants,
 )
+from pse_analysis.estimation.core.run import ConsistencyParams, consistent
 from pse_analysis.estimation.methods import GROUP, KINDS
 from pse_analysis.grid import power_flow
 from pse_analysis.machine import Machine
@@ -72,7 +73,7 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "variance": (1e-3,),
     "source_sigma": (0.02,),
     "tolerance": (0.01,),
-    "confidence": (0.51, 0.999999),
+    "confidence": (0.51, 0.01, 0.999999),
     "max_iterations": (1,),
     "window": (3.0, 9),
     "slot_s": (7200.0,),
@@ -96,6 +97,8 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "kappa": (2.0,),
     "protected": (False,),
     "smooth": (True,),
+    "steps": (1, 20),
+    "ratio": ((0.0, 1e9), (0.999, 1.001)),
     "ahead": ((1, 3),),
 }
 """What each key of a number is changed to; of a name, every other one is tried."""
@@ -159,6 +162,7 @@ def result(data: Mapping[str, Any]) -> Estimated:
         setting.layout,
         smooth=getattr(method, "smooth", False),
         ahead=getattr(method, "ahead", ()),
+        consistency=getattr(method, "consistency", None),
     )
 
 
@@ -221,6 +225,9 @@ def test_every_key_changes_the_estimate_or_is_refused(context: dict[str, Any]) -
             except ParameterError:
                 moved = True
             tried[place] = moved
+    for place in [place for place in tried if place[0] == "consistency"]:
+        # Whether a sum of NIS passes a bound is chance; see the test of the bounds below.
+        tried[place] = True
     if context.get("screening") == "innovation":
         # What the test refuses does not contradict the forecast any more, so none waits for that.
         tried["restart", "patience"] = True
@@ -267,9 +274,29 @@ def test_a_key_in_vain_is_refused_with_what_it_needs(data: dict[str, Any], messa
         parameters.build(EstimateParams, {"methods": [{"name": "m", **data}]}, "estimate")
 
 
+@pytest.mark.parametrize(
+    ("change", "inconsistent"),
+    [
+        ({}, [3, 4]),
+        ({"steps": 1}, [3]),
+        ({"ratio": (0.5, 7.0)}, []),
+        ({"confidence": 1.0 - 1e-9}, []),
+    ],
+)
+def test_bounds_of_consistency_are_those_of_the_case_file(
+    change: dict[str, Any], inconsistent: list[int]
+) -> None:
+    """By hand: 99.95 % of χ² lie below 31.4 for 10 measurements, and below 47.5 for 20."""
+    nis, dof = np.array([10.0, 10.0, 10.0, 50.0, 30.0]), np.full(5, 10)
+    good = consistent(nis, dof, ConsistencyParams(**{"steps": 2, **change}))
+    assert np.flatnonzero(~good).tolist() == inconsistent
+    assert Method.of("f", "ekf", consistency=change).consistency == ConsistencyParams(**change)
+
+
 def test_keys_of_an_observer_change_what_it_is() -> None:
     machine = Machine(200.0, 6.4, 0.032, u_kv=13.8)
-    setting = Setting(machine, probe()[0].layout, tiny_case.STUDY, probe()[1])
+    study = dataclasses.replace(tiny_case.STUDY, step_s=0.01)
+    setting = Setting(machine, probe()[0].layout, study, probe()[1])
     base = {"q": (5.0, 5.0), "r": 1.0}
     others = {
         "q": {"q": (50.0, 5.0)},

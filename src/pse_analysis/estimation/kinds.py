@@ -11,6 +11,7 @@ from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import machine, variants
 from pse_analysis.estimation.bad_data.innovation_test import InnovationTest, Refuse, refuse
 from pse_analysis.estimation.core.interface import Estimator
+from pse_analysis.estimation.core.run import ConsistencyParams
 from pse_analysis.estimation.filters import composition, intervals, restart
 from pse_analysis.estimation.filters.composition import Composition
 from pse_analysis.estimation.filters.kalman import kalman_filter
@@ -108,6 +109,8 @@ class GridFilter(GridMethod):
         What the filter is made of; each kind has some of the parts.
     restart : RestartParams
         When the filter starts again.
+    consistency : ConsistencyParams
+        When its status becomes ``inconsistent``.
     innovation_test : InnovationTest, optional
         Numbers of ``screening = "innovation"``; as for the noise by default.
     smooth : bool
@@ -126,6 +129,7 @@ class GridFilter(GridMethod):
     history: HistoryParams | None = None
     compose: Composition = field(default_factory=Composition)
     restart: RestartParams = field(default_factory=RestartParams)
+    consistency: ConsistencyParams = field(default_factory=ConsistencyParams)
     innovation_test: InnovationTest | None = None
     smooth: bool = False
     ahead: tuple[int, ...] = ()

@@ -88,14 +88,15 @@ def estimate(
         snapshots, layout = machine.snapshots(studied, layout, model)
         result = run(estimator, snapshots, model, layout, trial=trial, truth=reference)
     else:
-        smooth, ahead = (method.smooth, method.ahead) if isinstance(method, GridFilter) else (0, ())
+        own = method if isinstance(method, GridFilter) else None
         result = variants.run(
             estimator,
             list(studied.snapshots()),
             model,
             layout,
-            smooth=bool(smooth),
-            ahead=ahead,
+            smooth=own is not None and own.smooth,
+            ahead=() if own is None else own.ahead,
+            consistency=None if own is None else own.consistency,
             trial=trial,
             truth=reference,
         )

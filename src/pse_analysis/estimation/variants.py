@@ -15,7 +15,7 @@ import pandas as pd
 
 from pse_analysis.estimation.core import run as driver
 from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot
-from pse_analysis.estimation.core.run import Estimated, Watch
+from pse_analysis.estimation.core.run import ConsistencyParams, Estimated, Watch
 from pse_analysis.estimation.filters.smoother import Ahead, Trail
 from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.vocabulary import Status
@@ -43,6 +43,7 @@ def run(
     ahead: tuple[int, ...] = (),
     trial: int = 0,
     truth: FloatArray | None = None,
+    consistency: ConsistencyParams | None = None,
 ) -> Estimated:
     """Run an estimator over snapshots, and tell what it makes of them later and before.
 
@@ -59,6 +60,7 @@ def run(
     trial : int
     truth : (T, n) ndarray, optional
         As for `pse_analysis.estimation.core.run.run`.
+    consistency : ConsistencyParams, optional
 
     Returns
     -------
@@ -83,7 +85,14 @@ def run(
     if ahead:
         watch.append(timed(forecasts.watch))
     own = driver.run(
-        estimator, iter(snapshots), model, layout, trial=trial, truth=truth, watch=watch
+        estimator,
+        iter(snapshots),
+        model,
+        layout,
+        trial=trial,
+        truth=truth,
+        watch=watch,
+        consistency=consistency,
     )
     made = [own]
     m, status = len(layout), [Status(one) for one in own.steps["status"]]

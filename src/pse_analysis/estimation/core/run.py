@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from pse_analysis.errors import NotConverged, Unobservable
+from pse_analysis.errors import NotConverged, ParameterError, Unobservable
 from pse_analysis.estimation.core.interface import FAILURES, Estimate, Estimator, Info, Snapshot
 from pse_analysis.machine import STATES, Machine
 from pse_analysis.measurement import Model, SensorLayout, wrap
@@ -23,17 +23,38 @@ BoolArray = npt.NDArray[np.bool_]
 
 JITTER = 1e-10
 """Share of the largest variance that rounding may take from one that is zero."""
-CONSISTENCY_STEPS = 12
-"""Steps over which NIS is summed before a filter is called inconsistent."""
-CONSISTENCY_RATIO = (0.5, 2.0)
-"""NIS/m beyond which a filter is called inconsistent, if the χ² bounds are left as well.
-
-Real load is heavy-tailed and its volatility changes with the hour, so that the χ² bounds alone,
-which are right for a filter's own model, would condemn every filter.
-"""
 
 
 Watch = Callable[[int, Any, Info], None]
+
+
+@dataclass(frozen=True)
+class ConsistencyParams:
+    """When a filter is called inconsistent: by NIS over the last steps.
+
+    Attributes
+    ----------
+    steps : int
+        Steps over which NIS is summed; at the start there are fewer.
+    ratio : (2,) tuple of float
+        NIS/m beyond which it is, if the χ² bounds are left as well. Real load is heavy-tailed and
+        its volatility changes with the hour, so that the χ² bounds alone, which are right for a
+        filter's own model, would condemn every filter.
+    confidence : float
+        Share of good filters between the χ² bounds.
+    """
+
+    steps: int = 12
+    ratio: tuple[float, float] = (0.5, 2.0)
+    confidence: float = 0.999
+
+    def __post_init__(self) -> None:
+        low, high = self.ratio
+        if not (self.steps >= 1 and 0 <= low < 1 < high and 0 < self.confidence < 1):
+            raise ParameterError(
+                "consistency: expected steps ≥ 1, ratio = [below 1, above 1] and 0 < confidence < "
+                f"1, received {self.steps}, {list(self.ratio)} and {self.confidence}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +146,7 @@ def run(
     trial: int = 0,
     truth: FloatArray | None = None,
     watch: Sequence[Watch] = (),
+    consistency: ConsistencyParams | None = None,
 ) -> Estimated:
     """Run an estimator over snapshots; no snapshot stops the run.
 
@@ -139,6 +161,7 @@ def run(
         True states at the instants, for NEES: [θ; |V|] [rad, p.u.], or [θ; ω] [rad, rad/s].
     watch : sequence of callable
         Told the number of every instant, the state after it (None if there is none) and its info.
+    consistency : ConsistencyParams, optional
 
     Returns
     -------
@@ -163,7 +186,7 @@ def run(
         )
         for see in watch:
             see(k, state, info)
-    return _tables(estimator.name, trial, trace, states, layout)
+    return _tables(estimator.name, trial, trace, states, layout, consistency)
 
 
 def derived(
@@ -243,37 +266,41 @@ def _nees(estimate: Estimate | None, truth: FloatArray | None, folded: BoolArray
     return float(white @ white)
 
 
-def _consistent(nis: FloatArray, dof: npt.NDArray[np.int64]) -> BoolArray:
+def consistent(nis: FloatArray, dof: npt.NDArray[np.int64], params: ConsistencyParams) -> BoolArray:
     """Whether NIS of the last steps stays inside its bounds, at every step.
 
     At the start there are fewer; the first alone is as much as a single snapshot has to show.
     """
     known = np.isfinite(nis) & (dof > 0)
     total, freedom = (
-        pd.Series(np.where(known, part, 0.0))
-        .rolling(CONSISTENCY_STEPS, min_periods=1)
-        .sum()
-        .to_numpy()
+        pd.Series(np.where(known, part, 0.0)).rolling(params.steps, min_periods=1).sum().to_numpy()
         for part in (nis, dof)
     )
     with np.errstate(invalid="ignore", divide="ignore"):
-        low, high = stats.chi2.ppf([[0.0005], [0.9995]], freedom)
+        tail = 0.5 * (1.0 - params.confidence)
+        low, high = stats.chi2.ppf([[tail], [1.0 - tail]], freedom)
         ratio = total / freedom
-        wide = (ratio >= CONSISTENCY_RATIO[0]) & (ratio <= CONSISTENCY_RATIO[1])
+        wide = (ratio >= params.ratio[0]) & (ratio <= params.ratio[1])
     judged = np.isfinite(total) & (freedom > 0)
     return np.asarray(~judged | wide | ((total >= low) & (total <= high)))
 
 
 def _tables(
-    method: str, trial: int, trace: _Trace, states: States, layout: SensorLayout
+    method: str,
+    trial: int,
+    trace: _Trace,
+    states: States,
+    layout: SensorLayout,
+    consistency: ConsistencyParams | None = None,
 ) -> Estimated:
     times = pd.DatetimeIndex(np.asarray(trace.time, dtype="datetime64[us]"), tz="UTC")
     count, n = len(times), len(states)
     nis = np.array([i.nis for i in trace.info])
     dof = np.array([i.dof for i in trace.info], dtype=np.int64)
+    good = consistent(nis, dof, consistency or ConsistencyParams())
     status = [
-        Status.INCONSISTENT if i.status is Status.OK and not (good or i.tested) else i.status
-        for i, good in zip(trace.info, _consistent(nis, dof), strict=True)
+        Status.INCONSISTENT if i.status is Status.OK and not (fits or i.tested) else i.status
+        for i, fits in zip(trace.info, good, strict=True)
     ]
     used = np.array([i.used for i in trace.info]).reshape(count, len(layout))
     steps = pd.DataFrame(
