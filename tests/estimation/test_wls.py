@@ -282,6 +282,17 @@ def test_a_flat_start_knows_what_phase_shifters_turn() -> None:
         np.testing.assert_allclose(solution.x, truth, atol=1e-9)
 
 
+def test_shifters_in_series_turn_by_less_than_a_full_turn() -> None:
+    network = library.load("ieee33")
+    shift = np.zeros(network.n_branch)
+    shift[:3] = np.deg2rad(150.0)
+    turned = dataclasses.replace(
+        network, branches=dataclasses.replace(network.branches, shift_rad=shift)
+    )
+    expected = np.deg2rad([-150.0, 60.0, -90.0])  # -150, -300 and -450
+    np.testing.assert_allclose(turned.resting_angle_rad[1:4], expected, atol=1e-12)
+
+
 def test_without_the_angles_of_a_layout_the_slack_is_the_reference() -> None:
     network = library.load("ieee14")
     bus = np.arange(network.n_bus)

@@ -168,7 +168,7 @@ class WeightedLeastSquares:
         self._place[self.model.columns] = np.arange(len(self.model.columns))
         self._angular = np.flatnonzero(layout.angular)
         self._size = layout.quantity == IM
-        self._reference_of_angle = network.references[angular_buses(network, layout)]
+        self._references = network.references[angular_buses(network, layout)]
         self._open = Unobserved(self.model, self._cold, tolerance, max_iterations)
         self._gaps: dict[bytes, Gap] = {}
 
@@ -229,9 +229,7 @@ class WeightedLeastSquares:
         fitted = np.where(self._size, np.maximum(observed, 0.0), observed)
         problem = Problem(fitted, weight, rows, huber)
         starts = self._starts(problem, sigma) if start is None else iter([start.copy()])
-        silent = np.setdiff1d(
-            self._reference_of_angle, self._reference_of_angle[rows[self._angular]]
-        )
+        silent = np.setdiff1d(self._references, self._references[rows[self._angular]])
         fit, held = self._best(starts, problem, silent, reference, partial)
         return self._solution(fit, replace(problem, z=observed), held, partial)
 
