@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,7 +25,7 @@ MODULES = {
 
 # A part may import itself and what stands in an earlier line.
 LAYERS = (
-    ("errors",),
+    ("arrays", "errors"),
     ("leftovers",),
     ("files",),
     ("checksums",),
@@ -83,6 +84,16 @@ def test_imports_run_one_way(module: str) -> None:
         else:
             downward = LAYER[other] < LAYER[own] or (own, other) in WITHIN_LAYER
             assert downward, f"{module} imports {name}, which stands above it"
+
+
+def test_types_of_arrays_are_defined_once() -> None:
+    again = re.compile(
+        r"^\w+ *= *npt\.NDArray\[np\.(?:float64|complex128|int64|bool_)\]$", re.MULTILINE
+    )
+    found = {
+        module for module, path in MODULES.items() if again.search(path.read_text(encoding="utf-8"))
+    }
+    assert found == {"pse_analysis.arrays"}
 
 
 def test_every_part_has_a_layer() -> None:

@@ -18,12 +18,12 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, shortest_path
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.vocabulary import Reason
 
 if TYPE_CHECKING:
     from pse_analysis.grid.network import Network
 
-Floats = npt.NDArray[np.float64]
 
 ORANGE = "#E69F00"
 SKY = "#56B4E9"
@@ -145,7 +145,7 @@ def round_up(value: float) -> float:
     return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))
 
 
-def layout(network: Network) -> Floats:
+def layout(network: Network) -> FloatArray:
     """Where each bus is drawn; the same grid always gets the same picture.
 
     A radial feeder is drawn as its textbooks draw it: the longest path from the source on a
@@ -174,7 +174,7 @@ def layout(network: Network) -> Floats:
     return _stress(graph)
 
 
-def _rows(graph: csr_array, root: int) -> Floats:
+def _rows(graph: csr_array, root: int) -> FloatArray:
     """Tidy drawing of a tree: x is the depth, each path of tallest children has its own row."""
     order, parent = breadth_first_order(graph, root, directed=False)
     height = np.zeros(len(order), dtype=np.int64)
@@ -213,7 +213,7 @@ def _free(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
     return all(span[0] > last or span[1] < first for first, last in spans)
 
 
-def _stress(graph: csr_array, iterations: int = 300) -> Floats:
+def _stress(graph: csr_array, iterations: int = 300) -> FloatArray:
     """Positions whose distances follow the number of branches between buses."""
     hops = shortest_path(graph, directed=False, unweighted=True)
     hops[~np.isfinite(hops)] = np.max(hops[np.isfinite(hops)]) + 2.0

@@ -19,14 +19,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from scipy import linalg
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.vocabulary import as_number, plain_columns, shown, unwritable
-
-FloatArray = npt.NDArray[np.float64]
 
 ELEMENT = "machine"
 """Kind of element in tables: channels and states stand at ``machine/NAME``."""

@@ -15,10 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import eigh_tridiagonal
 
-FloatArray = npt.NDArray[np.float64]
+from pse_analysis.arrays import FloatArray
 
 OUTLIERS = 0.03
 """Share of samples at which a meter errs or a load between the two places switches."""

@@ -27,12 +27,11 @@ from dtaidistance.dtw import DTWSettings
 from pse_analysis.alignment import lag
 from pse_analysis.alignment.following import Device, follow
 from pse_analysis.alignment.lag import Band, Reference
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 
 __all__ = ["METHODS", "Match", "Method", "Reference", "Stamps", "TimeParams", "recover"]
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 FEWEST_SAMPLES = 6
 """Samples that a window must hold for a match."""

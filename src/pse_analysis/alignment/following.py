@@ -10,9 +10,7 @@ import numpy.typing as npt
 from pse_analysis.alignment import delays
 from pse_analysis.alignment.delays import Belief, Walk
 from pse_analysis.alignment.lag import FEWEST, Band, Reference, span_of
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from pse_analysis.arrays import FloatArray, IntArray
 
 DRIFTS = (0.005, 0.02, 0.06, 0.2, 1.0)
 """Standard deviations by which a delay may change between samples, relative to the band."""

@@ -20,14 +20,12 @@ from pse_analysis.alignment.dtw import TimeParams
 from pse_analysis.alignment.pseudo_measurements import PseudoParams
 from pse_analysis.alignment.samples import MICROSECOND, Samples, first_use
 from pse_analysis.alignment.stamps import sampling_times
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import Model, SensorLayout, standard_deviation, wrap
 from pse_analysis.parameters import Study, Unbounded
 from pse_analysis.vocabulary import Origin, Quantity, check
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 CENTURY_S = 3.2e9
 

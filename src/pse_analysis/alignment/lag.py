@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from pse_analysis.arrays import FloatArray
 
 FEWEST = 20
 """Increments below which a cross-correlation says nothing."""

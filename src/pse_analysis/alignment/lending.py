@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from pse_analysis.alignment.lag import FEWEST
-
-FloatArray = npt.NDArray[np.float64]
+from pse_analysis.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 Method = Literal["none", "hold", "holt", "profile", "ar"]
 SMOOTHING = tuple((a, b) for a in (0.3, 0.6, 0.8, 1.0) for b in (0.0, 0.1, 0.3))

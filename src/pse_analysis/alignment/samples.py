@@ -9,12 +9,9 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.alignment.stamps import SamplingTimes, microseconds
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.measurement import SensorLayout, standard_deviation, wrap
 from pse_analysis.vocabulary import usable
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 MICROSECOND = 1_000_000
 FEWEST_INCREMENTS = 12

@@ -13,12 +13,10 @@ from pse_analysis.alignment import dtw, lag, lending
 from pse_analysis.alignment.dtw import METHODS, NONE, Method, Stamps, TimeParams
 from pse_analysis.alignment.lag import Reference
 from pse_analysis.alignment.lending import Lender
+from pse_analysis.arrays import FloatArray, IntArray, utc_microseconds
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, IM, TO, P, Q, SensorLayout, standard_deviation
 from pse_analysis.vocabulary import usable
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 MICROSECOND = 1_000_000
 ALONE = 0.5
@@ -231,9 +229,7 @@ def _rms(values: pd.Series) -> float:
 
 def microseconds(times: pd.Series) -> IntArray:
     """Times as whole numbers. [µs since 1970 UTC]"""
-    return np.asarray(
-        times.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy().astype("datetime64[us]")
-    ).astype(np.int64)
+    return utc_microseconds(times).astype(np.int64)
 
 
 def _references(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import utc_microseconds
 from pse_analysis.errors import GridError, NotConverged, TableError, Unobservable
 from pse_analysis.estimation import machine, variants
 from pse_analysis.estimation.core.interface import Estimator, Info
@@ -17,8 +17,6 @@ from pse_analysis.machine import Machine
 from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.parameters import Study
 from pse_analysis.vocabulary import Status, check
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def estimate(
@@ -71,10 +69,7 @@ def estimate(
             f"trials {sorted(set(aligned['trial']))}"
         )
     layout = SensorLayout.from_channels(channels, model)
-    start, end = (
-        pd.Timestamp(t).tz_convert("UTC").tz_localize(None).to_datetime64().astype("datetime64[us]")
-        for t in (study.start, study.end)
-    )
+    start, end = utc_microseconds(pd.DatetimeIndex([study.start, study.end]))
     step = np.timedelta64(round(study.step_s * 1e6), "us")
     whole = record(rows, layout, np.arange(start, end, step))
     studied = whole.between(start, None)
@@ -139,8 +134,8 @@ def true_states(truth: pd.DataFrame, model: Model, times: np.ndarray, trial: int
     rows = truth[truth["trial"] == trial]
     names = pd.MultiIndex.from_arrays([states.element, states.quantity])
     column = names.get_indexer(pd.MultiIndex.from_frame(rows[["element", "quantity"]]))
-    stamps = rows["time_utc"].dt.tz_convert("UTC").dt.tz_localize(None).to_numpy()
-    row = pd.Index(times.astype("datetime64[us]")).get_indexer(stamps.astype("datetime64[us]"))
+    stamps = utc_microseconds(rows["time_utc"])
+    row = pd.Index(times.astype("datetime64[us]")).get_indexer(stamps)
     out = np.full((len(times), len(states)), np.nan)
     keep = (row >= 0) & (column >= 0)
     out[row[keep], column[keep]] = rows["value"].to_numpy()[keep]

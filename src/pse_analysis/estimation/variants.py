@@ -9,18 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.core import run as driver
 from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot
 from pse_analysis.estimation.core.run import ConsistencyParams, Estimated, Watch
 from pse_analysis.estimation.filters.smoother import Ahead, Trail
 from pse_analysis.measurement import Model, SensorLayout
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def smoothed_name(name: str) -> str:

@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION
 from pse_analysis.figures.paper import DOUBLE, MEASURED, Paper, legend, paper, styled
-
-Floats = npt.NDArray[np.float64]
 
 APART = 4.0
 """Distance between two curves of z-scores, in σ."""
@@ -26,15 +25,15 @@ class Match(Protocol):
     """What is read of `pse_analysis.alignment.dtw.Match`."""
 
     @property
-    def time(self) -> Floats:
+    def time(self) -> FloatArray:
         """Grid of both series. [s]"""
 
     @property
-    def device(self) -> Floats:
+    def device(self) -> FloatArray:
         """Z-scores of the device."""
 
     @property
-    def reference(self) -> Floats:
+    def reference(self) -> FloatArray:
         """Z-scores of its partner."""
 
     @property
@@ -46,11 +45,11 @@ class Decision(Protocol):
     """What is read of `pse_analysis.validation.adaptive.Decision`; arrays (n, 1)."""
 
     @property
-    def statistic(self) -> Floats:
+    def statistic(self) -> FloatArray:
         """What is compared."""
 
     @property
-    def threshold(self) -> Floats:
+    def threshold(self) -> FloatArray:
         """What it is compared with."""
 
     @property
@@ -121,7 +120,7 @@ def errors_at_instant(
 @styled
 def screened(
     step: npt.NDArray[np.int64],
-    shown: Mapping[str, tuple[Floats, Decision]],
+    shown: Mapping[str, tuple[FloatArray, Decision]],
     *,
     label: str,
     unit: str,

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.drawing import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
 from pse_analysis.errors import TableError
 from pse_analysis.figures.paper import DOUBLE, MEASURED, TRUTH, Paper, legend, paper, styled
-
-Floats = npt.NDArray[np.float64]
 
 _COLOURS = (BLUE, SKY, ORANGE, GREEN, VERMILION, PURPLE)
 _OWN = {"true": TRUTH, "measured": MEASURED}
@@ -21,8 +19,8 @@ _OWN = {"true": TRUTH, "measured": MEASURED}
 
 @styled
 def curves(
-    x: Floats,
-    panels: Mapping[str, Mapping[str, Floats]],
+    x: FloatArray,
+    panels: Mapping[str, Mapping[str, FloatArray]],
     label: str,
     *,
     log_x: bool = False,

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import NullLocator
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.drawing import BLUE, GREEN, ORANGE, SKY, VERMILION
 from pse_analysis.errors import TableError
 from pse_analysis.figures.paper import (
@@ -23,8 +24,6 @@ from pse_analysis.figures.paper import (
     styled,
 )
 from pse_analysis.machine import INPUT, STATES
-
-Floats = npt.NDArray[np.float64]
 
 _LABEL = dict(zip(STATES, ("θ [rad]", "ω [rad/s]"), strict=True))
 _TIME = "Time since the start [s]"
@@ -197,7 +196,7 @@ def through_gap(
 @styled
 def ratio_curve(
     ratios: npt.ArrayLike,
-    rms: Mapping[str, Floats],
+    rms: Mapping[str, FloatArray],
     simulated: pd.DataFrame,
     true_ratio: float,
     marks: Mapping[str, float],
@@ -247,7 +246,7 @@ def ratio_curve(
 @styled
 def model_cost(
     factor: npt.ArrayLike,
-    curves: Mapping[str, Floats],
+    curves: Mapping[str, FloatArray],
     matched: Sequence[float],
     *,
     width: float = DOUBLE,
@@ -281,11 +280,11 @@ def model_cost(
     return figure
 
 
-def _since(times: pd.Series, begin: pd.Timestamp) -> Floats:
+def _since(times: pd.Series, begin: pd.Timestamp) -> FloatArray:
     return np.asarray((times - begin).dt.total_seconds().to_numpy(dtype=np.float64))
 
 
-def _state(own: pd.DataFrame, quantity: str, begin: pd.Timestamp) -> tuple[Floats, Floats]:
+def _state(own: pd.DataFrame, quantity: str, begin: pd.Timestamp) -> tuple[FloatArray, FloatArray]:
     part = own[own.quantity == quantity].sort_values("time_utc")
     return _since(part.time_utc, begin), part.value.to_numpy(dtype=np.float64)
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.grid.network import Network
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class DcPowerFlow:

@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import GridError
 from pse_analysis.vocabulary import as_number, shown
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Columns = TypeVar("Columns", "Buses", "Branches")
 
 

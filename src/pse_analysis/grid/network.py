@@ -21,15 +21,12 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import sparse
 
+from pse_analysis.arrays import ComplexArray, FloatArray, IntArray
 from pse_analysis.errors import GridError
 from pse_analysis.grid import topology
 from pse_analysis.grid.elements import Branches, Buses, BusKind, freeze
 from pse_analysis.grid.plausibility import check_plausible
 from pse_analysis.grid.reading import read_tables
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 BASE_MVA = (1e-6, 1e9)
 """Base powers from that of a toy to that of all grids together. [MVA]"""

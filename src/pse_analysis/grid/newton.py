@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.errors import NotConverged
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 _ROUNDING = 8 * np.finfo(float).eps
 """Mismatch that rounding may leave, in units of the sum of |V_i Y_ij V_j| over j."""

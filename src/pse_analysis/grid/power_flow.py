@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import GridError, NotConverged
 from pse_analysis.grid.dc import DcPowerFlow
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.newton import NewtonPowerFlow, rounding_pu
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _USUAL_ITERATIONS = 10
 """Newton iterations that a flat start takes at most where it is any good."""

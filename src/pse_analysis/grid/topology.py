@@ -8,13 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.grid.elements import BusKind
 
 if TYPE_CHECKING:
     from pse_analysis.grid.network import Network
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 def connections(network: Network) -> sparse.csr_array:

@@ -10,6 +10,7 @@ S = V_m c*, so P, Q, |I| and ∠I at every place share one formula.
 
 from __future__ import annotations
 
+from pse_analysis.arrays import ComplexArray, FloatArray, IntArray
 from pse_analysis.measurement.layout import (
     BUS,
     DELTA_M,
@@ -23,9 +24,6 @@ from pse_analysis.measurement.layout import (
     TO,
     VA,
     VM,
-    ComplexArray,
-    FloatArray,
-    IntArray,
     Model,
     P,
     Q,

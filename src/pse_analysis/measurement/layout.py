@@ -11,14 +11,11 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import sparse
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
 from pse_analysis.vocabulary import UNITS, Aggregation, Quantity, SigmaKind
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 Model = Network | Machine
 """What a case is about: its channels measure a grid, or a machine."""

@@ -8,21 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import ComplexArray, FloatArray, IntArray
 from pse_analysis.grid.network import Network
-from pse_analysis.measurement.layout import (
-    IA,
-    IM,
-    VA,
-    VM,
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    P,
-    Q,
-    SensorLayout,
-    Terminals,
-    wrap,
-)
+from pse_analysis.measurement.layout import IA, IM, VA, VM, P, Q, SensorLayout, Terminals, wrap
 
 VANISHED = 1e-10
 """Current, in units of the sum of its terms, whose direction is next to nothing but rounding."""

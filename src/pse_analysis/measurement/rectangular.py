@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement.layout import (
     IA,
@@ -17,16 +17,12 @@ from pse_analysis.measurement.layout import (
     RELATIVE_FLOOR_PU,
     VA,
     VM,
-    ComplexArray,
-    FloatArray,
-    IntArray,
     P,
     Q,
     SensorLayout,
     Terminals,
 )
 
-BoolArray = npt.NDArray[np.bool_]
 Linearisation = Literal["derivative", "transform"]
 """Whether a power's row follows the voltage at its meter, or takes it as predicted."""
 BENT = 10.0

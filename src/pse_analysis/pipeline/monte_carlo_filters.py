@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.core.run_arrays import ArrayRun, run_arrays
 from pse_analysis.estimation.filters.composition import Composition, compose, scalar
@@ -26,9 +26,6 @@ from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout
 from pse_analysis.pipeline.processes import each
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 LARGE = 6.0
 """√S_ii beyond which a gross error counts as large."""

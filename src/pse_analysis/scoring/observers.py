@@ -6,14 +6,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation import Method, Observer
 from pse_analysis.estimation.machine import continuous_gain, rms
 from pse_analysis.machine import STATES, Densities, Machine
-
-FloatArray = npt.NDArray[np.float64]
 
 NAMES = dict(zip(STATES, ("angle", "speed"), strict=True))
 UNITS = dict(zip(STATES, ("rad", "rad/s"), strict=True))

@@ -15,11 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import integrate, linalg
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import NotConverged, ParameterError
 from pse_analysis.machine import Densities, Machine
-
-FloatArray = npt.NDArray[np.float64]
-
 
 LARGEST_GAIN = 1e4
 """Gains and times of a governor; beyond them its motion is stiff, and solving it never ends."""

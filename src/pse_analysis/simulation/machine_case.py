@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.machine import INPUT, STATES, Densities, Machine
 from pse_analysis.parameters import Study, Unbounded
@@ -20,8 +21,6 @@ from pse_analysis.simulation.sensors import Samples
 from pse_analysis.simulation.settings import LONGEST_S, SHORTEST_S, FaultParams, require_few
 from pse_analysis.telemetry import RawCase
 from pse_analysis.vocabulary import Aggregation, SigmaKind, Source
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from scipy.linalg import solve_toeplitz
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.checksums import read_checksums
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.files import check
 from pse_analysis.telemetry.parquet import read_arrow, to_pandas
-
-FloatArray = npt.NDArray[np.float64]
 
 PROFILE_STEP_S = 900.0
 """Step that curves must have. [s]"""

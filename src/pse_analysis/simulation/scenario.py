@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from scipy.linalg import lu_factor, lu_solve
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid import power_flow
 from pse_analysis.grid.elements import BusKind
@@ -23,9 +23,6 @@ from pse_analysis.simulation.settings import (
     SimulateParams,
     SourceVoltageParams,
 )
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 SECOND = 1_000_000
 """Microseconds: times are integers on that scale, so that no stamp is ever rounded twice."""

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.special import ndtr
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid import power_flow
 from pse_analysis.grid.network import Network
@@ -24,9 +25,6 @@ from pse_analysis.measurement import (
 from pse_analysis.simulation.scenario import SECOND, Truth
 from pse_analysis.simulation.settings import SensorParams
 from pse_analysis.vocabulary import UNITS, Quantity
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

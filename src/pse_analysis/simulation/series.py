@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
@@ -26,9 +26,6 @@ from pse_analysis.simulation.sensors import Samples
 from pse_analysis.simulation.settings import LONGEST_S, SHORTEST_S, FaultParams, require_few
 from pse_analysis.telemetry import RawCase
 from pse_analysis.vocabulary import Aggregation, Quantity, SigmaKind, Source
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 SOURCE_BUS = "source"
 BASE_MVA = 100.0

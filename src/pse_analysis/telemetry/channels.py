@@ -6,7 +6,6 @@ import difflib
 from collections.abc import Iterable
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis.errors import TableError
@@ -25,8 +24,6 @@ from pse_analysis.vocabulary import (
     shown,
     unwritable,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 SIGMA = (1e-12, 1e12)
 """Standard deviations that leave a weight 1/σ² which numbers can hold, in any unit."""

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import TableError
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import Model, SensorLayout
@@ -32,7 +33,6 @@ from pse_analysis.vocabulary import (
 
 log = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 
 _CHANNEL_DEFAULTS: Mapping[str, object] = {
     "side": "",

@@ -8,13 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import ComplexArray, FloatArray
 from pse_analysis.errors import TableError
 from pse_analysis.vocabulary import Quantity
 
 log = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 MAGNITUDES = (Quantity.VM_PU, Quantity.I_KA)
 ANGLES = (Quantity.VA_DEGREE, Quantity.IA_DEGREE)

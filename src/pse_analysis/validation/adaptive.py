@@ -36,15 +36,11 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.validation import tails, windows
 from pse_analysis.validation.forecasts import SPAN, Choice
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 Threshold = Literal["literal", "absolute", "scaled"]
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.validation.motion import Motion
 from pse_analysis.validation.sieve import Chunk
 from pse_analysis.validation.walk import Walk
 from pse_analysis.vocabulary import SEVERITY, Flag, Reason
-
-Array = npt.NDArray[np.float64]
 
 RULED_OUT = np.int32(
     sum(int(reason) for reason, level in SEVERITY.items() if level in (Flag.BAD, Flag.MISSING))
@@ -41,8 +40,8 @@ class Criteria:
         Whether a run of exact zeros counts; plant at rest reads zero.
     """
 
-    lower: Array
-    upper: Array
+    lower: FloatArray
+    upper: FloatArray
     motion: Motion
     stuck: npt.NDArray[np.int64]
     stuck_at_zero: npt.NDArray[np.bool_]
@@ -61,8 +60,8 @@ class Findings:
     """
 
     reasons: npt.NDArray[np.int32]
-    statistic: Array | None
-    threshold: Array | None
+    statistic: FloatArray | None
+    threshold: FloatArray | None
 
 
 def screen(
@@ -71,7 +70,7 @@ def screen(
     criteria: Criteria,
     *,
     reasons: npt.NDArray[np.int32] | None = None,
-    scale: Array | None = None,
+    scale: FloatArray | None = None,
     backward: npt.NDArray[np.bool_] | None = None,
     n_row: npt.NDArray[np.int64] | None = None,
     detail: bool = True,
@@ -164,12 +163,12 @@ _Where = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 
 
 def _stuck(
-    part: Array,
-    last: Array,
+    part: FloatArray,
+    last: FloatArray,
     run: npt.NDArray[np.int64],
     count: npt.NDArray[np.int64],
-    at_rest: Array,
-) -> tuple[_Where, npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+    at_rest: FloatArray,
+) -> tuple[_Where, npt.NDArray[np.int64], npt.NDArray[np.int64], FloatArray]:
     """Where a run of equal values has reached its count; its length there; state to carry on."""
     n = len(part)
     none = np.zeros(0, dtype=np.intp)

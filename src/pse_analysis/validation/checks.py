@@ -18,14 +18,13 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import BoolArray, FloatArray, utc_microseconds
 from pse_analysis.errors import ParameterError
 from pse_analysis.validation import timing
 from pse_analysis.validation.block import Criteria, screen
 from pse_analysis.validation.motion import Motion, extrapolating, given
 from pse_analysis.vocabulary import Reason
 
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 Samples = TypeVar("Samples", pd.Series, pd.DataFrame, npt.NDArray[Any])
 
 
@@ -159,7 +158,7 @@ def late(
     return _like(values, (known & (delay > limit))[:, None])
 
 
-def block(values: pd.Series | pd.DataFrame | npt.NDArray[Any]) -> Array:
+def block(values: pd.Series | pd.DataFrame | npt.NDArray[Any]) -> FloatArray:
     """Values as floats, (n, n_channel); what is not a number becomes NaN."""
     if isinstance(values, pd.Series):
         return numbers(values)[:, None]
@@ -170,7 +169,7 @@ def block(values: pd.Series | pd.DataFrame | npt.NDArray[Any]) -> Array:
     return array[:, None] if array.ndim == 1 else array
 
 
-def numbers(series: pd.Series) -> Array:
+def numbers(series: pd.Series) -> FloatArray:
     """A series as floats; NaN where it holds no number."""
     return np.asarray(pd.to_numeric(series, errors="coerce").to_numpy(dtype=float, na_value=np.nan))
 
@@ -179,8 +178,7 @@ def ticks(times: npt.ArrayLike | pd.Index) -> npt.NDArray[np.int64]:
     """Times as whole microseconds; numbers count as seconds; `timing.NO_TIME` where missing."""
     index = pd.Index(times)
     if isinstance(index, pd.DatetimeIndex):
-        utc = index.tz_convert("UTC").tz_localize(None) if index.tz is not None else index
-        return np.asarray(utc.as_unit("us").to_numpy().astype(np.int64))
+        return utc_microseconds(index).astype(np.int64)
     seconds = np.asarray(pd.to_numeric(index, errors="coerce"), dtype=float)
     known = np.isfinite(seconds) & (np.abs(seconds) < 4e12)
     return np.where(known, np.rint(np.where(known, seconds, 0.0) * 1e6), timing.NO_TIME).astype(
@@ -205,7 +203,7 @@ def _moved(
     period: float | pd.Timedelta | None,
     time: npt.ArrayLike | None,
     reason: Reason,
-) -> Bools:
+) -> BoolArray:
     x = block(values)
     n_channel = x.shape[1]
     stamps = _stamps(values, time)
@@ -266,7 +264,7 @@ def usual_step(time: npt.NDArray[np.int64]) -> float:
     return float(np.median(steps)) if len(steps) else 1e6
 
 
-def _like(values: Samples, flags: Bools) -> Samples:
+def _like(values: Samples, flags: BoolArray) -> Samples:
     if isinstance(values, pd.Series):
         return cast("Samples", pd.Series(flags[:, 0], index=values.index, name=values.name))
     n_channel = 1 if values.ndim == 1 else values.shape[1]
@@ -278,7 +276,7 @@ def _like(values: Samples, flags: Bools) -> Samples:
     return cast("Samples", wide[:, 0] if values.ndim == 1 else wide)
 
 
-def _positive(name: str, value: npt.ArrayLike) -> Array:
+def _positive(name: str, value: npt.ArrayLike) -> FloatArray:
     array = np.asarray(value, dtype=float)
     if not np.all(array > 0.0):
         raise ParameterError(f"{name} must be > 0, received {value!r}")

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.validation import extrapolation, thresholds
 from pse_analysis.validation.block import Criteria
 from pse_analysis.validation.increments import Structure
 from pse_analysis.validation.motion import Motion
 from pse_analysis.validation.rules import Rule
-
-Array = npt.NDArray[np.float64]
 
 FEWEST_EQUAL = 5
 """Least default number of equal values in a row that mean a stuck source."""
@@ -26,7 +25,7 @@ MOSTLY = 0.5
 """Share of repeats from which waiting for another value to confirm a step takes too long."""
 
 
-def stuck_after(repeats: Array) -> npt.NDArray[np.int64]:
+def stuck_after(repeats: FloatArray) -> npt.NDArray[np.int64]:
     """Equal values in a row that chance explains with less than `CHANCE_OF_RUN`.
 
     Parameters
@@ -48,9 +47,9 @@ def stuck_after(repeats: Array) -> npt.NDArray[np.int64]:
 def decide(
     rules: Sequence[Rule],
     structure: Structure | None,
-    sigma: Array,
-    scan_k: Array | None = None,
-    turn: Array | None = None,
+    sigma: FloatArray,
+    scan_k: FloatArray | None = None,
+    turn: FloatArray | None = None,
 ) -> Criteria:
     """Thresholds of every channel by its rule's criterion.
 
@@ -136,8 +135,8 @@ def decide(
 
 
 def _variance(
-    structure: Structure | None, sigma: Array, n: int
-) -> tuple[Array, npt.NDArray[np.bool_]]:
+    structure: Structure | None, sigma: FloatArray, n: int
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """v(n) and whether it is known; a history that never changes leaves the sensor's own noise."""
     if structure is None:
         return np.tile(np.arange(3.0), (n, 1)), np.zeros(n, dtype=bool)
@@ -149,7 +148,7 @@ def _variance(
     return variance, learnt
 
 
-def _quantile(rules: Sequence[Rule], amplitude: Array) -> Array:
+def _quantile(rules: Sequence[Rule], amplitude: FloatArray) -> FloatArray:
     """Quantile k = γ/σ of every channel."""
     q, q_max = _array(rules, "q"), _array(rules, "q_max")
     ratio = _array(rules, "cost_miss") / _array(rules, "cost_false_alarm")
@@ -172,7 +171,7 @@ def _quantile(rules: Sequence[Rule], amplitude: Array) -> Array:
     return out
 
 
-def _array(rules: Sequence[Rule], name: str) -> Array:
+def _array(rules: Sequence[Rule], name: str) -> FloatArray:
     return np.array(
         [np.nan if getattr(r, name) is None else float(getattr(r, name)) for r in rules],
         dtype=float,

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.grid.network import Network
 from pse_analysis.machine import Machine
@@ -36,8 +37,6 @@ from pse_analysis.measurement import (
 from pse_analysis.measurement.layout import metered_bus
 from pse_analysis.parameters import Unbounded
 from pse_analysis.vocabulary import Quantity
-
-Array = npt.NDArray[np.float64]
 
 NORMAL_KA = 4.0
 """Largest rated normal current of usual switchgear, from the series of IEC 62271-1. [kA]"""
@@ -127,8 +126,8 @@ class PhysicalLimits:
         What each follows from, for messages; "" where there is none.
     """
 
-    lower: Array
-    upper: Array
+    lower: FloatArray
+    upper: FloatArray
     origin: tuple[str, ...]
 
     def of(self, at: int) -> tuple[float, float]:
@@ -213,7 +212,7 @@ def nominal_mva(network: Network) -> float:
     return float(injected + network.base_mva * (shunt + charging))
 
 
-def _own_mva(network: Network) -> Array:
+def _own_mva(network: Network) -> FloatArray:
     """Nominal apparent power of each bus, load and generation added without sign. (n_bus,)"""
     bus = network.buses
     return np.asarray(np.hypot(np.abs(bus.p_load_mw) + np.abs(bus.p_gen_mw), bus.q_load_mvar))
@@ -223,7 +222,7 @@ def _of_grid(
     network: Network,
     layout: SensorLayout,
     params: DefaultLimits,
-    span: Array,
+    span: FloatArray,
     origin: npt.NDArray[np.object_],
 ) -> None:
     """Write the limits of powers and currents, in p.u., and what they follow from."""
@@ -250,7 +249,7 @@ def _of_machine(
     machine: Machine,
     params: DefaultLimits,
     quantity: npt.NDArray[np.int64],
-    span: Array,
+    span: FloatArray,
     origin: npt.NDArray[np.object_],
 ) -> None:
     """Write the limits of a rotor's speed and angle, in rad/s and rad."""

@@ -8,13 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.validation import extrapolation, thresholds, trials
 from pse_analysis.validation.block import Criteria
 from pse_analysis.validation.increments import N_LAG, Structure, learn
 from pse_analysis.validation.motion import gap_variance
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 MOVING = ("increment", "extrapolation")
 """The two checks whose rates the closed forms predict."""
@@ -248,14 +246,14 @@ def margins(
     return table.set_index("curve")
 
 
-def _found(errors: Array, largest: float, false_alarm: float) -> Array:
+def _found(errors: FloatArray, largest: float, false_alarm: float) -> FloatArray:
     """Mean probability that an error is found, a row per check, γ at equal false alarms."""
     gamma = np.quantile(np.abs(errors), 1.0 - false_alarm, axis=1, keepdims=True)
     low, high = np.maximum(-gamma - errors, -largest), np.minimum(gamma - errors, largest)
     return np.asarray((1.0 - np.maximum(high - low, 0.0) / (2.0 * largest)).mean(axis=1))
 
 
-def _blocks(errors: Array, rng: np.random.Generator, n_block: int) -> Array:
+def _blocks(errors: FloatArray, rng: np.random.Generator, n_block: int) -> FloatArray:
     """As many samples again, drawn in blocks, so that the course of a day stays together."""
     n = errors.shape[1]
     begin = rng.integers(0, n - n_block + 1, -(-n // n_block))
@@ -274,10 +272,10 @@ def _spread(check: str, rho: float) -> float:
     return float(np.sqrt(1.0 - rho**2)) if check == "extrapolation" else 1.0
 
 
-def _at_rate(faulty: trials.Faulty, structure: Structure, check: str, rate: float) -> Bools:
+def _at_rate(faulty: trials.Faulty, structure: Structure, check: str, rate: float) -> BoolArray:
     """Flags at the largest threshold whose realised false-alarm rate is at least ``rate``."""
 
-    def flags(quantile: float) -> Bools:
+    def flags(quantile: float) -> BoolArray:
         own: Criteria = trials.criteria(check, quantile, structure)
         return trials.flagged(faulty.value, own)
 

@@ -11,16 +11,15 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.validation.increments import Structure, autocorrelation
 from pse_analysis.validation.motion import SNAP
-
-Array = npt.NDArray[np.float64]
 
 SIGNIFICANT = 3.0
 """Standard errors by which the gain must exceed 0 for extrapolation to be used."""
 
 
-def closed_form(variance: npt.ArrayLike, m: int = 1) -> Array:
+def closed_form(variance: npt.ArrayLike, m: int = 1) -> FloatArray:
     """k_opt for τ = m·h from the structure function: Σ_{j=1..m} ρ_j.
 
     Parameters
@@ -39,14 +38,14 @@ def closed_form(variance: npt.ArrayLike, m: int = 1) -> Array:
     return np.asarray(rho[..., :m].sum(axis=-1))
 
 
-def error_variance(variance: npt.ArrayLike, k: npt.ArrayLike, m: int = 1) -> Array:
+def error_variance(variance: npt.ArrayLike, k: npt.ArrayLike, m: int = 1) -> FloatArray:
     """Variance of the extrapolation error over τ = m·h: v(m) − 2kσ²Σ_{j≤m} ρ_j + k²σ². [unit²]"""
     v = np.asarray(variance, dtype=float)
     u = np.asarray(k, dtype=float)
     return np.asarray(v[..., m] + v[..., 1] * u * (u - 2.0 * closed_form(v, m)))
 
 
-def gain_percent(naive_variance: npt.ArrayLike, optimal_variance: npt.ArrayLike) -> Array:
+def gain_percent(naive_variance: npt.ArrayLike, optimal_variance: npt.ArrayLike) -> FloatArray:
     """Gain in resolution ΔPC = 100·(D_n − D_opt)/D_n; eq. (16). [%]"""
     naive = np.asarray(naive_variance, dtype=float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -64,7 +63,9 @@ def gains(structure: Structure) -> npt.NDArray[np.bool_]:
     return np.asarray(structure.evidence > SIGNIFICANT)
 
 
-def errors(value: npt.ArrayLike, k: float | Array, m: int = 1, time: Array | None = None) -> Array:
+def errors(
+    value: npt.ArrayLike, k: float | FloatArray, m: int = 1, time: FloatArray | None = None
+) -> FloatArray:
     """Extrapolation errors x(t) − x̂(t) of eq. (12), referred to t − m·h and t − (m+1)·h.
 
     Parameters
@@ -99,8 +100,8 @@ def scan(
     value: npt.ArrayLike,
     grid: npt.ArrayLike | None = None,
     m: int = 1,
-    time: Array | None = None,
-) -> tuple[Array, Array]:
+    time: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
     """The paper's search (15): variance of the extrapolation error against k, Fig. 2.
 
     Parameters

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+from pse_analysis.arrays import BoolArray, FloatArray
 
 SPAN = 4
 """Values that a forecast rests on."""

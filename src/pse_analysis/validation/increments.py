@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.validation.block import Criteria, screen
 from pse_analysis.validation.motion import SNAP, Motion
 from pse_analysis.vocabulary import Reason
-
-Array = npt.NDArray[np.float64]
 
 N_LAG = 8
 """Lags of v(n) that are estimated; beyond, increments count as uncorrelated."""
@@ -54,24 +53,24 @@ class Structure:
         standard error of this difference: how sure the gain is.
     """
 
-    variance: Array
+    variance: FloatArray
     count: npt.NDArray[np.int64]
-    repeats: Array
-    scale: Array | None = None
-    evidence: Array = field(default_factory=lambda: np.empty(0))
+    repeats: FloatArray
+    scale: FloatArray | None = None
+    evidence: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> FloatArray:
         """σ of the good one-period increment, (n_channel,). [unit]"""
         return np.asarray(np.sqrt(self.variance[:, 1]))
 
     @property
-    def autocorrelation(self) -> Array:
+    def autocorrelation(self) -> FloatArray:
         """ρ_1 … ρ_{N_LAG−1} of the increments, (n_channel, N_LAG − 1)."""
         return autocorrelation(self.variance)
 
 
-def autocorrelation(variance: npt.ArrayLike) -> Array:
+def autocorrelation(variance: npt.ArrayLike) -> FloatArray:
     """ρ_1 … ρ_{N−1} of increments from v(0 … N) along the last axis; 0 where v(1) = 0."""
     v = np.asarray(variance, dtype=float)
     second = v[..., 2:] - 2.0 * v[..., 1:-1] + v[..., :-2]
@@ -127,7 +126,7 @@ def learn(
     repeats = _repeats(kept, t)
     endless = np.full(n_channel, np.inf)
     moments, count = _moments(kept, t, 1, endless)
-    scale: Array | None = None
+    scale: FloatArray | None = None
     if robust and n:
         kept, sigma, scale = _clipped(kept, t, bins, n_bin, clip)
         rho = autocorrelation(_structure(kept, t, 2, clip, sigma))[:, 0]
@@ -143,7 +142,7 @@ def learn(
     return Structure(variance, count, repeats, scale, evidence)
 
 
-def unwound(x: Array, turn: Array) -> Array:
+def unwound(x: FloatArray, turn: FloatArray) -> FloatArray:
     """Angles as they would read without the jump at the end of a turn, (n, n_channel)."""
     out = x.copy()
     for lane in np.flatnonzero(np.isfinite(turn)):
@@ -153,12 +152,12 @@ def unwound(x: Array, turn: Array) -> Array:
 
 
 def isolated(
-    x: Array,
-    t: Array,
-    rho: Array,
+    x: FloatArray,
+    t: FloatArray,
+    rho: FloatArray,
     *,
     clip: float = CLIP,
-    scale: Array | None = None,
+    scale: FloatArray | None = None,
 ) -> npt.NDArray[np.bool_]:
     """Samples that stand apart from both their neighbours, largest first; not for use online.
 
@@ -217,8 +216,8 @@ def isolated(
 
 
 def _clipped(
-    dirty: Array, t: Array, bins: npt.NDArray[np.intp] | None, n_bin: int, clip: float
-) -> tuple[Array, Array, Array | None]:
+    dirty: FloatArray, t: FloatArray, bins: npt.NDArray[np.intp] | None, n_bin: int, clip: float
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """History without what lies beyond ``clip`` σ of the last good sample; σ; its scale by bin."""
     sigma, scale, kept = _start(dirty, t), None, dirty
     for _ in range(_ROUNDS):
@@ -236,7 +235,9 @@ def _clipped(
     return kept, sigma, scale
 
 
-def _structure(x: Array, t: Array, n_lag: int, clip: float, sigma: Array) -> Array:
+def _structure(
+    x: FloatArray, t: FloatArray, n_lag: int, clip: float, sigma: FloatArray
+) -> FloatArray:
     """v(0 … n_lag) from σ and the increments over longer spans, (n_channel, n_lag + 1)."""
     variance = np.zeros((x.shape[1], n_lag + 1))
     variance[:, 1] = np.square(sigma)
@@ -258,7 +259,7 @@ def _inside(clip: float) -> float:
     return 1.0 - 2.0 * clip * density / (2.0 * float(ndtr(clip)) - 1.0)
 
 
-def _ratio(error: Array, clip: float, scale: Array | None) -> Array:
+def _ratio(error: FloatArray, clip: float, scale: FloatArray | None) -> FloatArray:
     """|error| over its standard error per channel; 0 where there is none."""
     size = np.abs(error) if scale is None else np.abs(error) / scale
     spread = np.zeros(error.shape[1])
@@ -278,7 +279,7 @@ def _ratio(error: Array, clip: float, scale: Array | None) -> Array:
         return np.nan_to_num(np.where(spread > 0.0, size / spread, 0.0), nan=0.0, posinf=0.0)
 
 
-def _evidence(x: Array, t: Array, rho: Array) -> Array:
+def _evidence(x: FloatArray, t: FloatArray, rho: FloatArray) -> FloatArray:
     """Paired statistic of the gain by extrapolation; 0 where there are too few pairs.
 
     The usual standard error of ρ̂₁, 1/√n, is right for Gaussian increments only: on real loads a
@@ -298,7 +299,7 @@ def _evidence(x: Array, t: Array, rho: Array) -> Array:
     return np.where((count >= FEWEST) & np.isfinite(sure), sure, 0.0)
 
 
-def _difference(x: Array, t: Array, lag: int) -> Array:
+def _difference(x: FloatArray, t: FloatArray, lag: int) -> FloatArray:
     """x[lag:] − x[:−lag], NaN where that is not ``lag`` periods."""
     if len(x) <= lag:
         return np.full((0, x.shape[1]), np.nan)
@@ -309,8 +310,8 @@ def _difference(x: Array, t: Array, lag: int) -> Array:
 
 
 def _moments(
-    x: Array, t: Array, lag: int, bound: Array, scale: Array | None = None
-) -> tuple[Array, npt.NDArray[np.int64]]:
+    x: FloatArray, t: FloatArray, lag: int, bound: FloatArray, scale: FloatArray | None = None
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Mean square of the increments over ``lag`` periods inside the bound, and their number."""
     change = _difference(x, t, lag)
     if scale is not None:
@@ -322,7 +323,7 @@ def _moments(
     return total / np.maximum(count, 1), count.astype(np.int64)
 
 
-def _start(x: Array, t: Array) -> Array:
+def _start(x: FloatArray, t: FloatArray) -> FloatArray:
     """First σ: from the median absolute increment, of those that are not 0 where half are."""
     change = np.abs(_difference(x, t, 1))
     change[~(change > 0.0)] = np.nan
@@ -334,7 +335,7 @@ def _start(x: Array, t: Array) -> Array:
 
 
 def _outlying(
-    x: Array, t: Array, sigma: Array, clip: float, scale: Array | None
+    x: FloatArray, t: FloatArray, sigma: FloatArray, clip: float, scale: FloatArray | None
 ) -> npt.NDArray[np.bool_]:
     n_channel = x.shape[1]
     quantile = np.where(sigma > 0.0, clip, np.inf)
@@ -356,21 +357,23 @@ def _outlying(
     return np.asarray((found & Reason.INCREMENT) != 0)
 
 
-def _repeats(x: Array, t: Array) -> Array:
+def _repeats(x: FloatArray, t: FloatArray) -> FloatArray:
     change = _difference(x, t, 1)
     real = np.isfinite(change) & (x[1:] != 0.0) if len(x) > 1 else np.isfinite(change)
     same = real & (change == 0.0)
     return np.asarray(same.sum(axis=0) / np.maximum(real.sum(axis=0), 1))
 
 
-def _spread(scale: Array, bins: npt.NDArray[np.intp]) -> Array:
+def _spread(scale: FloatArray, bins: npt.NDArray[np.intp]) -> FloatArray:
     """Scale of each sample, (n, n_channel), from (n_bin, n_channel)."""
     if bins.shape[1] == 1:
         return scale[bins[:, 0]]
     return scale[bins, np.arange(scale.shape[1])[None, :]]
 
 
-def _by_bin(x: Array, t: Array, bins: npt.NDArray[np.intp], n_bin: int, sigma: Array) -> Array:
+def _by_bin(
+    x: FloatArray, t: FloatArray, bins: npt.NDArray[np.intp], n_bin: int, sigma: FloatArray
+) -> FloatArray:
     """σ per bin over σ; 1 where a bin holds too few increments."""
     change = _difference(x, t, 1)
     at = np.broadcast_to(bins[1:], change.shape) if len(bins) > 1 else bins[:0]

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from pse_analysis.arrays import FloatArray, IntArray
 
 SNAP = 0.25
 """Elapsed times within a quarter period of n periods count as n: jitter is not a change of rate."""
@@ -39,12 +38,12 @@ class Motion:
         second opinion, and confirms no step. All do where nothing is given.
     """
 
-    structure: Array
-    k: Array
-    increment: Array
-    extrapolation: Array
-    confirm: Ints
-    turn: Array = field(default_factory=lambda: np.empty(0))
+    structure: FloatArray
+    k: FloatArray
+    increment: FloatArray
+    extrapolation: FloatArray
+    confirm: IntArray
+    turn: FloatArray = field(default_factory=lambda: np.empty(0))
     repeats: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def __post_init__(self) -> None:
@@ -65,17 +64,17 @@ class Motion:
                 )
 
     @property
-    def increment_threshold(self) -> Array:
+    def increment_threshold(self) -> FloatArray:
         """γ of the first-increment check over one period, (n_channel,). [unit]"""
         return times_sigma(self.increment, np.sqrt(self.structure[:, 1]))
 
     @property
-    def extrapolation_threshold(self) -> Array:
+    def extrapolation_threshold(self) -> FloatArray:
         """γ of the extrapolation check over one period, (n_channel,). [unit]"""
         return times_sigma(self.extrapolation, np.sqrt(self.one_step_variance))
 
     @property
-    def one_step_variance(self) -> Array:
+    def one_step_variance(self) -> FloatArray:
         """σ²(1 − 2kρ₁ + k²) for the k in use, (n_channel,). [unit²]"""
         v1, v2 = self.structure[:, 1], self.structure[:, 2]
         return np.maximum(v1 * (1.0 + self.k**2) - self.k * (v2 - 2.0 * v1), 0.0)
@@ -142,7 +141,7 @@ def extrapolating(
     )
 
 
-def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> Array:
+def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> FloatArray:
     """v(0 … n_lag) from σ and ρ_1, ρ_2, …: v(m) = σ²(m + 2Σ_{i<m}(m−i)ρ_i).
 
     Parameters
@@ -166,14 +165,14 @@ def gap_variance(sigma: npt.ArrayLike, rho: npt.ArrayLike, n_lag: int) -> Array:
     return np.asarray(s2 * (np.arange(n_lag + 1) + 2.0 * (r @ weight.T)))
 
 
-def shortest(change: Array, turn: float | Array) -> Array:
+def shortest(change: FloatArray, turn: float | FloatArray) -> FloatArray:
     """Change of an angle without whole turns; unchanged where the turn is infinite."""
     with np.errstate(invalid="ignore"):
         less = change - turn * np.rint(change / turn)
     return np.asarray(np.where(np.isinf(turn), change, less))
 
 
-def times_sigma(quantile: Array, sigma: Array) -> Array:
+def times_sigma(quantile: FloatArray, sigma: FloatArray) -> FloatArray:
     """k·σ with ∞·0 = ∞: a check that is not made has no threshold."""
     with np.errstate(invalid="ignore"):
         product = quantile * sigma

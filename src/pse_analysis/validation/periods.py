@@ -11,13 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import IntArray, utc_microseconds
 from pse_analysis.vocabulary import Aggregation
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 FEWEST_SPACINGS = 20
 """Spacings below which nothing is said of a channel."""
@@ -95,7 +92,7 @@ def wrong_periods(telemetry: pd.DataFrame, channels: pd.DataFrame) -> pd.DataFra
         for column in (
             telemetry["trial"].to_numpy(),
             position,
-            telemetry["time_utc"].dt.as_unit("us").dt.tz_localize(None).to_numpy(),
+            utc_microseconds(telemetry["time_utc"]),
         )
     )
     stated = channels["period_s"].to_numpy(dtype=float)
@@ -145,7 +142,7 @@ def sentences(wrong: pd.DataFrame, most: int = 5) -> Iterator[str]:
         )
 
 
-def _period(lane: Ints, time: Ints, stated: float) -> float | None:
+def _period(lane: IntArray, time: IntArray, stated: float) -> float | None:
     """The period that a channel's sorted stamps show, if they show one and it is not ``stated``."""
     later = np.diff(time)[np.diff(lane) == 0]
     d = np.sort(later[later > 0]) / 1e6

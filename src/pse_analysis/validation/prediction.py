@@ -12,13 +12,9 @@ v(m) − K²·v(g). At m = g = 1 these are K = ρ₁ and σ²(1 − ρ₁²).
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.validation.motion import Motion, shortest
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 
 
 class Prediction:
@@ -38,11 +34,11 @@ class Prediction:
         rise = np.diff(motion.structure, axis=1)
         self._rise = np.hstack([rise, np.maximum(rise[:, -1:], 0.0)]).ravel()
 
-    def shortest(self, lane: Ints, change: Array) -> Array:
+    def shortest(self, lane: IntArray, change: FloatArray) -> FloatArray:
         """Changes of the given channels; those of angles without whole turns. (n,) [unit]"""
         return shortest(change, self._turn[lane]) if self._turns else change
 
-    def variance(self, lane: Ints, periods: Array, floor: Array) -> Array:
+    def variance(self, lane: IntArray, periods: FloatArray, floor: FloatArray) -> FloatArray:
         """v(n) at real n ≥ 1, linear between whole lags and beyond the last; (n,) [unit²]."""
         n = np.fmax(periods, 1.0)
         low = np.minimum(n, self._n_lag).astype(np.int64)
@@ -53,14 +49,14 @@ class Prediction:
 
     def extrapolate(
         self,
-        lane: Ints,
-        lead: Array,
-        span: Array,
-        elapsed: Array,
-        k_one: Array,
-        floor: Array,
-        older: Bools | None,
-    ) -> tuple[Array | float, Array, Array]:
+        lane: IntArray,
+        lead: FloatArray,
+        span: FloatArray,
+        elapsed: FloatArray,
+        k_one: FloatArray,
+        floor: FloatArray,
+        older: BoolArray | None,
+    ) -> tuple[FloatArray | float, FloatArray, FloatArray]:
         """Predict the change since the reference.
 
         Parameters

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.validation.motion import SNAP, Motion, shortest
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 _CACHED_SAMPLES = 1 << 15
 
@@ -33,13 +31,13 @@ class Chunk:
         Samples that are older than one before them: checked, but never a reference.
     """
 
-    value: Array
-    time: Array
+    value: FloatArray
+    time: FloatArray
     reasons: npt.NDArray[np.int32]
-    statistic: Array | None = None
-    threshold: Array | None = None
-    scale: Array | None = None
-    backward: Bools | None = None
+    statistic: FloatArray | None = None
+    threshold: FloatArray | None = None
+    scale: FloatArray | None = None
+    backward: BoolArray | None = None
 
 
 class Sieve:
@@ -59,14 +57,14 @@ class Sieve:
         both = extrapolates & np.isfinite(motion.increment)
         self._second = np.where(both, motion.increment_threshold, np.inf) if both.any() else None
         self._turn = motion.turn
-        self._last_time: Array | None = None
-        self._scratch: tuple[Array, Bools] | None = None
+        self._last_time: FloatArray | None = None
+        self._scratch: tuple[FloatArray, BoolArray] | None = None
 
-    def samples(self, n: int) -> Array:
+    def samples(self, n: int) -> FloatArray:
         """Buffer for the samples of the next chunk after two rows of halo, (n + 2, n_channel)."""
         return self._work(n)[0]
 
-    def _work(self, n: int) -> tuple[Array, Bools]:
+    def _work(self, n: int) -> tuple[FloatArray, BoolArray]:
         # Fresh arrays of this size would cost a page fault every 512 samples.
         if self._scratch is None or len(self._scratch[1]) < n:
             width = len(self._k)
@@ -74,7 +72,7 @@ class Sieve:
         extended, fine = self._scratch
         return extended[: n + 2], fine[:n]
 
-    def fine(self, chunk: Chunk, value: Array, lead: Array) -> Bools:
+    def fine(self, chunk: Chunk, value: FloatArray, lead: FloatArray) -> BoolArray:
         """Find the samples of a chunk, which stand in `samples`, that are ordinary.
 
         Parameters
@@ -97,7 +95,9 @@ class Sieve:
         self._last_time = np.array(chunk.time[-1:], copy=True)
         return fine
 
-    def _compare(self, chunk: Chunk, extended: Array, lead: Array, fine: Bools) -> None:
+    def _compare(
+        self, chunk: Chunk, extended: FloatArray, lead: FloatArray, fine: BoolArray
+    ) -> None:
         """Mark the samples that lie inside their threshold."""
         n, n_channel = chunk.value.shape
         second = self._second
@@ -133,7 +133,7 @@ class Sieve:
             if chunk.threshold is not None:
                 chunk.threshold[rows] = limit
 
-    def _mark_uneven(self, fine: Bools, time: Array) -> None:
+    def _mark_uneven(self, fine: BoolArray, time: FloatArray) -> None:
         """Take out the samples that do not come one period after the row before."""
         before = self._last_time
         if before is None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from pse_analysis import vocabulary
+from pse_analysis.arrays import FloatArray, IntArray, utc_microseconds
 from pse_analysis.errors import ParameterError, TableError
 from pse_analysis.measurement import Model
 from pse_analysis.validation import extrapolation, periods
@@ -21,9 +22,6 @@ from pse_analysis.validation.increments import Structure, learn, unwound
 from pse_analysis.validation.rules import Rule, ValidateParams, resolve
 from pse_analysis.validation.timing import Stamps, time_reasons
 from pse_analysis.vocabulary import Quantity, Reason
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
@@ -147,8 +145,8 @@ def _warn_of_limits(
     channels: pd.DataFrame,
     rules: list[Rule],
     default: PhysicalLimits,
-    channel: Ints,
-    value: Array,
+    channel: IntArray,
+    value: FloatArray,
     reasons: npt.NDArray[np.int32],
 ) -> None:
     """Say which channels have no sample inside their limits: mostly limits in another unit."""
@@ -168,20 +166,20 @@ def _warn_of_limits(
 
 
 def _screen_lanes(
-    lanes: Ints,
+    lanes: IntArray,
     stamps: Stamps,
-    value: Array,
-    period: Array,
+    value: FloatArray,
+    period: FloatArray,
     rules: list[Rule],
     history: npt.NDArray[np.bool_],
     until: int | None,
-    sigma: Array,
+    sigma: FloatArray,
     relative: npt.NDArray[np.bool_],
-    turn: Array,
+    turn: FloatArray,
     reasons: npt.NDArray[np.int32],
     backward: npt.NDArray[np.bool_],
-    statistic: Array,
-    threshold: Array,
+    statistic: FloatArray,
+    threshold: FloatArray,
 ) -> None:
     """Screen channels of like length as one block and scatter the findings."""
     length = stamps.length[lanes]
@@ -199,7 +197,7 @@ def _screen_lanes(
     bins = (stamps.time[at] % _DAY * n_bin // _DAY).astype(np.intp) if n_bin else None
 
     structure: Structure | None = None
-    scan_k: Array | None = None
+    scan_k: FloatArray | None = None
     noise = sigma[lanes]
     if until is not None:
         past = real & history[at] & ((found & RULED_OUT) == 0) & ~np.where(real, backward[at], True)
@@ -233,7 +231,7 @@ def _screen_lanes(
         threshold[target] = np.where(np.isinf(result.threshold), np.nan, result.threshold)[real]
 
 
-def _alike(length: Ints, rules: list[Rule]) -> list[Ints]:
+def _alike(length: IntArray, rules: list[Rule]) -> list[IntArray]:
     """Groups of channels that make one block: lengths within a factor of two, one set of bins."""
     if not len(length):
         return []
@@ -243,7 +241,7 @@ def _alike(length: Ints, rules: list[Rule]) -> list[Ints]:
     return [np.flatnonzero(group == g) for g in range(int(group.max()) + 1)]
 
 
-def _typical(value: Array) -> Array:
+def _typical(value: FloatArray) -> FloatArray:
     """Median magnitude of each channel's history; 0 where it is empty."""
     out = np.zeros(value.shape[1])
     some = np.isfinite(value).any(axis=0)
@@ -252,12 +250,14 @@ def _typical(value: Array) -> Array:
     return out
 
 
-def _sigmas(channels: pd.DataFrame, lane_channel: Ints) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _sigmas(
+    channels: pd.DataFrame, lane_channel: IntArray
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     relative = (channels["sigma_kind"] == vocabulary.SigmaKind.RELATIVE).to_numpy(dtype=bool)
     return channels["sigma"].to_numpy(dtype=float)[lane_channel], relative[lane_channel]
 
 
-def _channel_code(telemetry: pd.DataFrame, channels: pd.DataFrame) -> Ints:
+def _channel_code(telemetry: pd.DataFrame, channels: pd.DataFrame) -> IntArray:
     known = pd.Index(channels["channel"])
     which, names = pd.factorize(telemetry["channel"])
     position = known.get_indexer(pd.Index(names))
@@ -272,14 +272,14 @@ def _channel_code(telemetry: pd.DataFrame, channels: pd.DataFrame) -> Ints:
     return np.asarray(position[which], dtype=np.int64)
 
 
-def _lanes(trial: npt.NDArray[np.int32], code: Ints) -> Ints:
+def _lanes(trial: npt.NDArray[np.int32], code: IntArray) -> IntArray:
     if not len(code):
         return np.zeros(0, dtype=np.int64)
     new = (np.diff(trial) != 0) | (np.diff(code) != 0)
     return np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
 
 
-def _quality(quality: pd.Series, rules: list[Rule], lane: Ints) -> npt.NDArray[np.int32]:
+def _quality(quality: pd.Series, rules: list[Rule], lane: IntArray) -> npt.NDArray[np.int32]:
     out = np.zeros(len(lane), dtype=np.int32)
     if not any(rule.bad_quality for rule in rules) or quality.isna().all():
         return out
@@ -291,14 +291,14 @@ def _quality(quality: pd.Series, rules: list[Rule], lane: Ints) -> npt.NDArray[n
     return out
 
 
-def _microseconds(times: pd.Series) -> Ints:
+def _microseconds(times: pd.Series) -> IntArray:
     """Microseconds since 1970; the least int64 where there is no time."""
     if not isinstance(times.dtype, pd.DatetimeTZDtype):
         raise TableError(
             f"telemetry: {times.name} is {times.dtype}, expected datetime64[us, UTC]: "
             "state the time zone with .dt.tz_localize(...) and .dt.tz_convert('UTC')"
         )
-    return np.asarray(times.dt.as_unit("us").dt.tz_localize(None).to_numpy().astype(np.int64))
+    return utc_microseconds(times).astype(np.int64)
 
 
 def _instant(moment: datetime | None) -> int | None:

@@ -9,11 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from pse_analysis.arrays import FloatArray, IntArray
 
 FEWEST_IN_TAIL = 40
 """Residuals below which nothing is said about their tail."""

@@ -20,9 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import log_ndtr, ndtr
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
-
-Array = npt.NDArray[np.float64]
 
 DEFAULT_AMPLITUDE = 6.0
 """A = a/σ as (5) prints it; 3 is the reading 'after rejection by three sigma'."""
@@ -58,21 +57,21 @@ class Threshold:
         Prior probability of a gross error; for minimax the least favourable one.
     """
 
-    k: Array
+    k: FloatArray
     verdict: npt.NDArray[np.int8]
-    false_alarm: Array
-    miss: Array
-    risk: Array
-    q: Array
+    false_alarm: FloatArray
+    miss: FloatArray
+    risk: FloatArray
+    q: FloatArray
 
 
-def good_density(x: npt.ArrayLike) -> Array:
+def good_density(x: npt.ArrayLike) -> FloatArray:
     """Density of the good increment in units of σ; eq. (4)."""
     u = np.asarray(x, dtype=float)
     return np.asarray(np.exp(-0.5 * u * u - _LOG_SQRT_2PI))
 
 
-def error_density(x: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> Array:
+def error_density(x: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> FloatArray:
     """Density of the increment with a gross error, in units of σ; eq. (6) with its mass restored.
 
     Parameters
@@ -87,7 +86,7 @@ def error_density(x: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE
     return np.asarray((ndtr(a - np.abs(u)) - ndtr(-a - np.abs(u))) / (2.0 * a))
 
 
-def false_alarm(k: npt.ArrayLike, *, truncate_at: float = np.inf) -> Array:
+def false_alarm(k: npt.ArrayLike, *, truncate_at: float = np.inf) -> FloatArray:
     """Probability that a good increment exceeds k·σ; eq. (9), to infinity unless truncated.
 
     Parameters
@@ -101,7 +100,7 @@ def false_alarm(k: npt.ArrayLike, *, truncate_at: float = np.inf) -> Array:
     return np.asarray(np.maximum(2.0 * (ndtr(-u) - ndtr(-truncate_at)), 0.0))
 
 
-def miss(k: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> Array:
+def miss(k: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> FloatArray:
     """Probability that an increment with a gross error stays within k·σ; eq. (10).
 
     Parameters
@@ -130,18 +129,18 @@ def risk(
     q: npt.ArrayLike,
     cost_ratio: npt.ArrayLike = 1.0,
     amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE,
-) -> Array:
+) -> FloatArray:
     """Mean cost (1−q)·F_FA(k) + q·r·F_M(k), in units of the cost of a false alarm; eq. (8)."""
     p, r = _floats(q, cost_ratio)
     return np.asarray((1.0 - p) * false_alarm(k) + p * r * miss(k, amplitude))
 
 
-def likelihood_ratio(k: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> Array:
+def likelihood_ratio(k: npt.ArrayLike, amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> FloatArray:
     """f₁(k)/f₂(k): decreases in k ≥ 0, from ``degenerate_odds`` to 0."""
     return np.asarray(np.exp(_log_ratio(*_floats(k, amplitude))))
 
 
-def degenerate_odds(amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> Array:
+def degenerate_odds(amplitude: npt.ArrayLike = DEFAULT_AMPLITUDE) -> FloatArray:
     """Λ = q·r/(1−q) from which rejecting every sample is the cheapest: 4.787 at A = 6."""
     return likelihood_ratio(0.0, amplitude)
 
@@ -240,19 +239,19 @@ def minimax(
     )
 
 
-def _log_ratio(k: Array, a: Array) -> Array:
+def _log_ratio(k: FloatArray, a: FloatArray) -> FloatArray:
     """Log f₁(k)/f₂(k), exact far into both tails."""
     near, far = log_ndtr(a - k), log_ndtr(-a - k)
     log_f2 = near + np.log1p(-np.exp(far - near)) - np.log(2.0 * a)
     return np.asarray(-0.5 * k * k - _LOG_SQRT_2PI - log_f2)
 
 
-def _tail(u: Array) -> Array:
+def _tail(u: FloatArray) -> FloatArray:
     """∫_u^∞ [1 − Φ(s)] ds = φ(u) − u·[1 − Φ(u)]."""
     return np.asarray(np.exp(-0.5 * u * u - _LOG_SQRT_2PI) - u * ndtr(-u))
 
 
-def _bisect(decreasing: object, upper: Array) -> Array:
+def _bisect(decreasing: object, upper: FloatArray) -> FloatArray:
     """Root on [0, ∞) of a function that decreases through zero, elementwise."""
     assert callable(decreasing)
     low = np.zeros_like(upper)
@@ -271,18 +270,18 @@ def _bisect(decreasing: object, upper: Array) -> Array:
     return np.asarray(0.5 * (low + high))
 
 
-def _floats(*values: npt.ArrayLike) -> tuple[Array, ...]:
+def _floats(*values: npt.ArrayLike) -> tuple[FloatArray, ...]:
     arrays = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in values))
     return tuple(np.array(v, dtype=float) for v in arrays)
 
 
-def _positive(name: str, value: Array) -> None:
+def _positive(name: str, value: FloatArray) -> None:
     if not np.all((value > 0.0) & np.isfinite(value)):
         worst = value[~((value > 0.0) & np.isfinite(value))].ravel()[0]
         raise ParameterError(f"{name} must be positive and finite, received {worst}")
 
 
-def _probability(name: str, value: Array) -> None:
+def _probability(name: str, value: FloatArray) -> None:
     if not np.all((value >= 0.0) & (value <= 1.0)):
         worst = value[~((value >= 0.0) & (value <= 1.0))].ravel()[0]
         raise ParameterError(f"{name} is a probability: expected 0 … 1, received {worst}")

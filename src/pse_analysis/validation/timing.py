@@ -7,11 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.vocabulary import Reason
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 GAP_PERIODS = 1.5
 """Elapsed periods from which at least one sample is missing."""
@@ -40,11 +37,11 @@ class Stamps:
         Microseconds since 1970; `NO_TIME` where the arrival is not known.
     """
 
-    lane: Ints
-    time: Ints
-    arrival: Ints
-    start: Ints = field(init=False)
-    length: Ints = field(init=False)
+    lane: IntArray
+    time: IntArray
+    arrival: IntArray
+    start: IntArray = field(init=False)
+    length: IntArray = field(init=False)
 
     def __post_init__(self) -> None:
         first = np.flatnonzero(np.diff(self.lane, prepend=-1))
@@ -52,12 +49,12 @@ class Stamps:
         object.__setattr__(self, "length", np.diff(np.append(first, len(self.lane))))
 
     @property
-    def arrived(self) -> Bools:
+    def arrived(self) -> BoolArray:
         """Whether the time of arrival is known."""
         return np.asarray(self.arrival != NO_TIME)
 
 
-def ahead(stamps: Stamps, period_s: Array) -> Bools:
+def ahead(stamps: Stamps, period_s: FloatArray) -> BoolArray:
     """Samples whose stamp lies in the future.
 
     Where the arrival is known, a stamp more than a period (`SKEW_S` at least) after it is
@@ -96,7 +93,7 @@ def ahead(stamps: Stamps, period_s: Array) -> Bools:
     return out
 
 
-def latest_before(stamps: Stamps, wrong: Bools | None = None) -> Ints:
+def latest_before(stamps: Stamps, wrong: BoolArray | None = None) -> IntArray:
     """Latest stamp among the earlier samples of the lane; `NO_TIME` where there is none."""
     out = np.full(len(stamps.time), NO_TIME)
     if not len(stamps.time):
@@ -112,7 +109,7 @@ def latest_before(stamps: Stamps, wrong: Bools | None = None) -> Ints:
     return out
 
 
-def duplicates(stamps: Stamps) -> Bools:
+def duplicates(stamps: Stamps) -> BoolArray:
     """Samples whose stamp an earlier sample of the lane already had."""
     out = np.zeros(len(stamps.time), dtype=bool)
     if len(out):
@@ -122,7 +119,7 @@ def duplicates(stamps: Stamps) -> Bools:
     return out
 
 
-def echoes(stamps: Stamps, value: Array, period_s: Array) -> Bools:
+def echoes(stamps: Stamps, value: FloatArray, period_s: FloatArray) -> BoolArray:
     """Samples that repeat their predecessor's value within half a period of its stamp.
 
     A source without a clock of its own is stamped on arrival, so a telegram that is delivered
@@ -137,7 +134,7 @@ def echoes(stamps: Stamps, value: Array, period_s: Array) -> Bools:
     return out
 
 
-def usual_delay(stamps: Stamps, history: Bools) -> Array:
+def usual_delay(stamps: Stamps, history: BoolArray) -> FloatArray:
     """Median delay of arrival in the history of each lane; 0 where it has none. [s]"""
     out = np.zeros(len(stamps.start))
     chosen = history & stamps.arrived
@@ -154,8 +151,8 @@ def usual_delay(stamps: Stamps, history: Bools) -> Array:
 
 
 def time_reasons(
-    stamps: Stamps, value: Array, period_s: Array, late_s: Array, history: Bools
-) -> tuple[npt.NDArray[np.int32], Bools]:
+    stamps: Stamps, value: FloatArray, period_s: FloatArray, late_s: FloatArray, history: BoolArray
+) -> tuple[npt.NDArray[np.int32], BoolArray]:
     """Reasons of the time checks, and which samples are older than one that arrived before them.
 
     Parameters

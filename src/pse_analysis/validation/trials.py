@@ -14,12 +14,10 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.signal import lfilter
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.validation.block import RULED_OUT, Criteria, screen
 from pse_analysis.validation.increments import Structure
 from pse_analysis.validation.motion import Motion
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 CHECKS = ("limits", "increment", "extrapolation", "combination")
 
@@ -37,9 +35,9 @@ class Faulty(NamedTuple):
         Their size, 0 elsewhere. [unit]
     """
 
-    value: Array
-    bad: Bools
-    size: Array
+    value: FloatArray
+    bad: BoolArray
+    size: FloatArray
 
 
 class Rates(NamedTuple):
@@ -67,7 +65,7 @@ def generated_load(
     sigma: float = 1.0,
     level: float = 0.0,
     n_channel: int = 1,
-) -> Array:
+) -> FloatArray:
     """Loads whose increments are AR(1), (n, n_channel). [unit]
 
     Parameters
@@ -90,7 +88,9 @@ def generated_load(
     return np.asarray(level + sigma * np.cumsum(change, axis=0))
 
 
-def with_errors(value: Array, rng: np.random.Generator, *, share: float, largest: float) -> Faulty:
+def with_errors(
+    value: FloatArray, rng: np.random.Generator, *, share: float, largest: float
+) -> Faulty:
     """The load with a share of its samples off by U(−largest, largest)."""
     x = np.asarray(value, dtype=float)
     bad = rng.random(x.shape) < share
@@ -103,8 +103,8 @@ def criteria(
     quantile: float,
     structure: Structure,
     *,
-    lower: float | Array = np.nan,
-    upper: float | Array = np.nan,
+    lower: float | FloatArray = np.nan,
+    upper: float | FloatArray = np.nan,
     confirm: int = 2,
 ) -> Criteria:
     """One check alone, or all of them, at k = γ/σ.
@@ -145,13 +145,13 @@ def criteria(
     )
 
 
-def flagged(value: Array, checked: Criteria) -> Bools:
+def flagged(value: FloatArray, checked: Criteria) -> BoolArray:
     """Samples that the checks rule out, as they would be online."""
     found = screen(value, np.arange(len(value)), checked, detail=False)
     return np.asarray((found.reasons & RULED_OUT) != 0)
 
 
-def flagged_given_references(value: Array, checked: Criteria) -> Bools:
+def flagged_given_references(value: FloatArray, checked: Criteria) -> BoolArray:
     """Flags of the third row where the first two are taken as references whatever they are.
 
     The closed forms hold given good reference samples: each channel is then one draw.
@@ -168,7 +168,7 @@ def flagged_given_references(value: Array, checked: Criteria) -> Bools:
     return np.asarray((found.reasons[2] & RULED_OUT) != 0)
 
 
-def rates(flags: Bools, bad: Bools) -> Rates:
+def rates(flags: BoolArray, bad: BoolArray) -> Rates:
     """Realised false-alarm and miss rates."""
     shares, errors = [], []
     for hits in (flags[~bad], ~flags[bad]):
@@ -178,7 +178,7 @@ def rates(flags: Bools, bad: Bools) -> Rates:
     return Rates(shares[0], shares[1], errors[0], errors[1])
 
 
-def cost(flags: Bools, bad: Bools, cost_ratio: float = 1.0) -> Array:
+def cost(flags: BoolArray, bad: BoolArray, cost_ratio: float = 1.0) -> FloatArray:
     """Cost of each decision, in units of a false alarm; its mean is the realised risk (8)."""
     return np.where(bad, cost_ratio * ~flags, 1.0 * flags)
 

@@ -17,14 +17,11 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.validation.motion import SNAP, Motion
 from pse_analysis.validation.prediction import Prediction
 from pse_analysis.validation.sieve import Chunk, Sieve
 from pse_analysis.vocabulary import Reason
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 
 _NOWHERE = -9.0
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -44,7 +41,7 @@ class _At(enum.IntEnum):
     STEP_TIME = 8
 
 
-def _unknown(n_channel: int) -> Array:
+def _unknown(n_channel: int) -> FloatArray:
     """State of channels that have had no sample, (n_channel, 9)."""
     state = np.full((n_channel, len(_At)), np.nan)
     state[:, [_At.ROW, _At.LEAD_ROW]] = _NOWHERE
@@ -52,7 +49,7 @@ def _unknown(n_channel: int) -> Array:
     return state
 
 
-def _ordinary(state: Array, row: Ints | float) -> Bools:
+def _ordinary(state: FloatArray, row: IntArray | float) -> BoolArray:
     """Whether the two rows before ``row`` are the reference and its predecessor."""
     return np.asarray(
         (state[:, _At.ROW] == row - 1)
@@ -74,8 +71,8 @@ class Walk:
     """
 
     motion: Motion
-    n_row: Ints | None = None
-    _state: Array = field(init=False)
+    n_row: IntArray | None = None
+    _state: FloatArray = field(init=False)
     _row: int = field(init=False, default=0)
     _whole: bool = field(init=False, default=True)
 
@@ -96,7 +93,7 @@ class Walk:
             ]
         )
 
-    def samples(self, n: int) -> Array:
+    def samples(self, n: int) -> FloatArray:
         """Buffer for the samples of the next chunk, (n, n_channel), NaN where ruled out."""
         return self._sieve.samples(n)[2:]
 
@@ -115,7 +112,7 @@ class Walk:
             self._walk(fine, self._sieve.samples(n), chunk)
         self._row += n
 
-    def _walk(self, fine: Bools, extended: Array, chunk: Chunk) -> None:
+    def _walk(self, fine: BoolArray, extended: FloatArray, chunk: Chunk) -> None:
         """Walk every channel from each sample that is not fine until it is ordinary again."""
         n, n_channel = chunk.value.shape
         stop = np.full(n_channel, n)
@@ -146,7 +143,7 @@ class Walk:
                 moved = calm[jumps]
                 self._enter(lane[moved], row[moved], extended, chunk.time)
 
-    def _enter(self, lane: Ints, row: Ints, extended: Array, time: Array) -> None:
+    def _enter(self, lane: IntArray, row: IntArray, extended: FloatArray, time: FloatArray) -> None:
         """Set the state of channels that reach ``row`` in the ordinary way."""
         if not len(lane):
             return
@@ -162,7 +159,7 @@ class Walk:
         state[:, _At.COUNT] = -1.0
         self._state[lane] = state
 
-    def _decide(self, lane: Ints, row: Ints, chunk: Chunk, whole: bool) -> Array:
+    def _decide(self, lane: IntArray, row: IntArray, chunk: Chunk, whole: bool) -> FloatArray:
         """Decide one sample of each given channel; the channels' state after it."""
         state = self._state[lane]
         x = chunk.value[row, lane]
@@ -233,17 +230,17 @@ class Walk:
 
     def _confirm(
         self,
-        lane: Ints,
-        state: Array,
-        x: Array,
-        t: Array,
-        factor: Array | None,
-        waits: Bools,
-        agreement: Array,
-        floor: Array,
-        confirm: Array,
+        lane: IntArray,
+        state: FloatArray,
+        x: FloatArray,
+        t: FloatArray,
+        factor: FloatArray | None,
+        waits: BoolArray,
+        agreement: FloatArray,
+        floor: FloatArray,
+        confirm: FloatArray,
         whole: bool,
-    ) -> Bools:
+    ) -> BoolArray:
         """Whether flagged samples confirm a step, a level that flagged ones share; keeps count."""
         accepted = np.zeros(len(lane), dtype=bool)
         which = np.flatnonzero(waits)
@@ -270,17 +267,17 @@ class Walk:
         return accepted
 
 
-def _at(table: npt.NDArray[_Scalar], row: Ints, lane: Ints) -> npt.NDArray[_Scalar]:
+def _at(table: npt.NDArray[_Scalar], row: IntArray, lane: IntArray) -> npt.NDArray[_Scalar]:
     return np.asarray(table[row, 0] if table.shape[1] == 1 else table[row, lane])
 
 
-def _snapped(periods: Array) -> Array:
+def _snapped(periods: FloatArray) -> FloatArray:
     whole = np.rint(periods)
     near = (np.abs(periods - whole) <= SNAP) & (whole >= 1.0)
     return np.asarray(np.where(near, whole, periods))
 
 
-def _next_event(events: Ints, lane: Ints, row: Ints, n: int) -> Ints:
+def _next_event(events: IntArray, lane: IntArray, row: IntArray, n: int) -> IntArray:
     """First event of each lane at or after its row; n where there is none in the chunk."""
     start = lane * n
     return np.asarray(np.minimum(events[np.searchsorted(events, start + row)] - start, n))

@@ -14,15 +14,13 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.estimation.core.interface import Estimate, Estimator, Info, Snapshot
 from pse_analysis.estimation.core.snapshots import Record
 from pse_analysis.measurement import IA, VA, SensorLayout
 from pse_analysis.validation import adaptive
 from pse_analysis.validation.adaptive import AdaptiveParams, AdaptiveState
 from pse_analysis.vocabulary import Reason
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class ScreenedState(NamedTuple):

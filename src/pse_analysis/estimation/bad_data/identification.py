@@ -13,15 +13,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.estimation.core.cholesky import Columns
 from pse_analysis.measurement import MeasurementModel
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 PRIOR_SIGMA_PU = 1.0
 """σ of a voltage of which nothing is known but its rating. [p.u., rad]"""

@@ -11,13 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import lapack
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import ParameterError
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 Refuse = Callable[[FloatArray, FloatArray, FloatArray], BoolArray]
 """(innovation (m,), lower Cholesky factor of its covariance (m, m), σ of the measurements (m,)) ->

@@ -14,18 +14,14 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 from scipy.linalg import blas
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.bad_data.identification import Deletion
 from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.core.cholesky import Root, cleaned
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 CONFIDENCE = 0.999
 """Share of snapshots without gross errors that pass the gate of a perfectly tuned filter."""

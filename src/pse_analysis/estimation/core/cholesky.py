@@ -10,12 +10,9 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 
 SMALL = 128
 """Rows up to which LAPACK inverts a triangle faster than two halves of it are."""

@@ -14,11 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import PseError
 from pse_analysis.vocabulary import Reason, Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 FAILURES = (ArithmeticError, ValueError, RuntimeError, PseError)
 """What the numbers of a snapshot may raise; `numpy.linalg.LinAlgError` is a ValueError."""

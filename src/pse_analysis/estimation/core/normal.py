@@ -10,14 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.measurement import MeasurementModel
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 DOUBTFUL = 1e-10
 """Smallest pivot of the gain, scaled to a unit diagonal, that still leaves half of the digits."""

@@ -12,14 +12,12 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import NotConverged, ParameterError, Unobservable
 from pse_analysis.estimation.core.interface import FAILURES, Estimate, Estimator, Info, Snapshot
 from pse_analysis.machine import STATES, Machine
 from pse_analysis.measurement import Model, SensorLayout, wrap
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 JITTER = 1e-10
 """Share of the largest variance that rounding may take from one that is zero."""

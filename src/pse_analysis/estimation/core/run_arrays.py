@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import TableError
 from pse_analysis.estimation.core.interface import Info, Snapshot
 from pse_analysis.estimation.filters.recursion import GaussianFilter
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 EPOCH = np.datetime64("2000-01-01T00:00:00", "us")
 

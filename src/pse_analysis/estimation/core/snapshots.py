@@ -10,13 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import BoolArray, FloatArray, utc_microseconds
 from pse_analysis.errors import TableError
 from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.measurement import SensorLayout
 from pse_analysis.vocabulary import Origin, usable
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +76,7 @@ def record(
     TableError
         If a channel is not in the layout, or a row stands twice.
     """
-    stamps = _utc(aligned["time_utc"])
+    stamps = utc_microseconds(aligned["time_utc"])
     times = np.unique(stamps if instants is None else np.concatenate([stamps, instants]))
     row = np.searchsorted(times, stamps)
     column = pd.Index(layout.channel).get_indexer(aligned["channel"])
@@ -108,8 +106,3 @@ def record(
         fresh=scattered(good & (aligned["origin"] != Origin.HELD).to_numpy(), 0, bool),
         age_s=scattered(aligned["age_s"], 0.0),
     )
-
-
-def _utc(times: pd.Series) -> npt.NDArray[np.datetime64]:
-    naive = times.dt.tz_convert("UTC").dt.tz_localize(None)
-    return np.asarray(naive.to_numpy().astype("datetime64[us]"))

@@ -11,15 +11,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray
 from pse_analysis.estimation.process.dynamics import Process
 from pse_analysis.measurement.rectangular import Linear, Memo, Pattern
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-ComplexArray = npt.NDArray[np.complex128]
 
 
 class Belief(NamedTuple):

@@ -13,15 +13,12 @@ from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import blas
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.estimation.bad_data.robust import InnovationStats
 from pse_analysis.estimation.core.cholesky import Root, absorbed, cholesky, factor, solve, symmetric
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 Rows = slice | IntArray
 
 FEW = 4

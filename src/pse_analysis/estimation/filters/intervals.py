@@ -10,11 +10,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.estimation.core.snapshots import Record
 from pse_analysis.measurement import SensorLayout
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 _INSTANT = 1e-3
 """Width, in steps, of the interval that stands for an instant in the bridge's covariance."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray
 from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.core.cholesky import cleaned
 from pse_analysis.estimation.core.interface import (
@@ -39,11 +40,6 @@ from pse_analysis.grid.network import Network
 from pse_analysis.measurement import RectangularModel, SensorLayout
 from pse_analysis.measurement.rectangular import Linearisation, Memo
 from pse_analysis.vocabulary import Reason, Status
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 MAX_PASSES = 8
 

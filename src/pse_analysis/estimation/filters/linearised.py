@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.estimation.filters.conditioning import Moments, Prior
 from pse_analysis.estimation.filters.update import Observation
 from pse_analysis.measurement import IA, IM, MeasurementModel, wrap
 from pse_analysis.measurement.layout import Terminals
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-
 
 NEGLIGIBLE = 0.1
 """Share of its σ up to which the remainder of an expansion is passed over."""

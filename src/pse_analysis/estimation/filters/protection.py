@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.estimation.bad_data import robust
 from pse_analysis.estimation.bad_data.identification import PRIOR_SIGMA_PU
 from pse_analysis.estimation.bad_data.robust import MARGIN, Protection
@@ -25,10 +25,6 @@ from pse_analysis.estimation.filters.update import Update, UpdateReport, update
 from pse_analysis.estimation.static.robust_wls import begin
 from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.measurement import MeasurementModel
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 PASSES = 3
 """Linearisations about what a widened forecast leads to."""

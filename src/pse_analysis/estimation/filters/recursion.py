@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.estimation.bad_data import robust
 from pse_analysis.estimation.bad_data.robust import GrossErrorTest, Protection
 from pse_analysis.estimation.core.interface import (
@@ -34,10 +34,6 @@ from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import VA, VM, MeasurementModel, SensorLayout, wrap
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.core.interface import FAILURES, Estimate, Estimator, Info, Snapshot
 from pse_analysis.measurement import VM, SensorLayout
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 FAR = 30.0
 """Deviation, in units of its σ, from which a measurement is off by more than noise and load."""

@@ -10,16 +10,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import ComplexArray, FloatArray
 from pse_analysis.estimation.filters.augmented_state import AugmentedState, Belief, Reach, Rows
 from pse_analysis.estimation.filters.conditioning import Moments
 from pse_analysis.estimation.filters.linearised import linear_halves
 from pse_analysis.measurement.rectangular import Frame, Linear, Linearisation
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 REFINE_PU = 1e-3
 """Transformed rows are renewed if an update moves a voltage by more than this. [p.u.]"""

@@ -13,15 +13,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import ComplexArray, FloatArray, IntArray
 from pse_analysis.estimation.filters.conditioning import Prior, Rows
 from pse_analysis.measurement import IM, VA, VM, MeasurementModel, P, Q
 from pse_analysis.measurement.layout import Terminals
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 Parts = tuple[FloatArray, FloatArray]
 
 

@@ -13,9 +13,9 @@ from math import isqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.core.cholesky import cholesky, solve
 from pse_analysis.estimation.core.interface import (
     Dynamics,
@@ -26,8 +26,6 @@ from pse_analysis.estimation.core.interface import (
     Transition,
 )
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
 
 WIDENED = 1.0 + 1e-6
 """σ² after an instant over that before it from which a filter has been made less certain."""

@@ -16,15 +16,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.bad_data.robust import InnovationStats
 from pse_analysis.estimation.core.cholesky import Root, absorbed, factor, reflect, solve, symmetric
 from pse_analysis.estimation.filters.conditioning import Posterior, Prior, Rows, Verdict, block
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 class Halves(NamedTuple):

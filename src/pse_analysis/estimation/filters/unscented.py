@@ -33,10 +33,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy import optimize
 from scipy.linalg import blas, lapack
 
+from pse_analysis.arrays import ComplexArray, FloatArray, IntArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.core.cholesky import symmetric
 from pse_analysis.estimation.core.interface import Snapshot
@@ -46,9 +46,6 @@ from pse_analysis.estimation.filters.square_root import Halves
 from pse_analysis.estimation.filters.update import Observation
 from pse_analysis.measurement import BUS, FROM, TO, MeasurementModel, P, Q, wrap
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 Form = Literal["covariance", "square_root"]
 
 ALPHA_RANGE = (0.02, 1.0)

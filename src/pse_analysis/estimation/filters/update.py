@@ -8,8 +8,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.estimation.bad_data.identification import Deletion, of_snapshot
 from pse_analysis.estimation.bad_data.robust import FORGETTING, GrossErrorTest, InnovationStats
 from pse_analysis.estimation.core.interface import Info, Snapshot
@@ -17,9 +17,6 @@ from pse_analysis.estimation.filters.conditioning import Posterior, Predicted, P
 from pse_analysis.estimation.filters.restart import gross_errors
 from pse_analysis.measurement import MeasurementModel, wrap
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 Observe = Callable[[Prior, Snapshot, IntArray, float, FloatArray], Predicted]
 """(prior, snapshot, rows, alpha, s) -> prediction of the rows, linearised at s where it matters."""

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg, signal
 
+from pse_analysis.arrays import ComplexArray, FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.machine import Densities, Machine, sample
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest count as zero."""

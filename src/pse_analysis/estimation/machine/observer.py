@@ -8,13 +8,12 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.core.interface import Estimate, Estimator, Info, Snapshot
 from pse_analysis.estimation.machine.gain import Poles, Tuning, discrete_gain, filter_gain
 from pse_analysis.machine import Densities, Machine, sample
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
 
 NEEDS_INPUT = (
     "the observer needs the machine's input ΔM = M_mech - M_el in per unit of {base:g} MVA at "

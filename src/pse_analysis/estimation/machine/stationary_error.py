@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.machine.gain import (
     Tuning,
@@ -15,8 +16,6 @@ from pse_analysis.estimation.machine.gain import (
     discrete_gain,
 )
 from pse_analysis.machine import Densities, Machine, sample
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def continuous_covariance(

@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.machine.gain import Tuning, discrete_gain
 from pse_analysis.estimation.machine.observer import observe
 from pse_analysis.estimation.machine.stationary_error import discrete_covariance
 from pse_analysis.machine import Densities, Machine
 from pse_analysis.simulation.machine import disturb
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class Simulated(NamedTuple):

@@ -13,18 +13,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import lapack
 
+from pse_analysis.arrays import ComplexArray, FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.core.snapshots import Record
 from pse_analysis.estimation.process.load_noise import Sensitivity, at_least, in_frame, turned_rows
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, P, Q, SensorLayout
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 START = np.array([0.02, 0.02, 1e-3]) ** 2
 """Levels before anything was seen: (share of nominal load)² alone and together, and p.u.²"""

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

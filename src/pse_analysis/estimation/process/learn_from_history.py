@@ -8,13 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, optimize, signal
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.core.snapshots import Record
 from pse_analysis.estimation.process.load_noise import LoadStatistics, Sensitivity, to_polar
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VM, P, Q, SensorLayout, standard_deviation
-
-FloatArray = npt.NDArray[np.float64]
 
 DAY_S = 86400.0
 FEWEST_CHANGES = 24

@@ -13,15 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import lapack
 
+from pse_analysis.arrays import ComplexArray, FloatArray
 from pse_analysis.errors import NotConverged
 from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 KEPT_PU = 1e-2
 """Sensitivities are kept while no voltage moves by more. [p.u.]

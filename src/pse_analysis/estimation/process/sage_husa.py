@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.process.dynamics import Process
 from pse_analysis.estimation.process.load_noise import ProcessNoise, in_frame, to_polar
 from pse_analysis.grid.network import Network
-
-FloatArray = npt.NDArray[np.float64]
 
 ROUNDING = 1e-14
 """Share of the variances that make up another one, below which it is zero."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
-FloatArray = npt.NDArray[np.float64]
+from pse_analysis.arrays import FloatArray
 
 CRITICAL = 1e-5
 """Share of a row's variance in its residual below which nothing else sees what it measures."""

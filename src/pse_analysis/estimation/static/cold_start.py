@@ -6,19 +6,15 @@ from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import NotConverged
 from pse_analysis.grid.dc import DcPowerFlow
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, IA, IM, VA, VM, P, RectangularModel, SensorLayout
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 MOST = 10
 """Iterations of the power flow that gives the nominal state; more are not worth their time."""

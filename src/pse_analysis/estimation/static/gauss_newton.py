@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.estimation.core.normal import (
     AugmentedFactor,
     Factor,
@@ -19,9 +19,6 @@ from pse_analysis.estimation.core.normal import (
 from pse_analysis.estimation.static.observability import open_states
 from pse_analysis.estimation.static.small_currents import SmallCurrents
 from pse_analysis.measurement import IA, IM, MeasurementModel
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 COARSE = 1e-2
 """Largest step of a converged state whose rows are weighed by their residuals. [rad, p.u.]"""

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg, sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.estimation.core.normal import equilibrated
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 RESOLUTION = 1e-9
 """Singular value, of a Jacobian with rows and columns of norm one, that counts as zero."""

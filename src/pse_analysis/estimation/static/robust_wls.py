@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.bad_data.identification import of_snapshot
 from pse_analysis.estimation.bad_data.robust import FAR, gate
@@ -14,9 +14,6 @@ from pse_analysis.estimation.core.interface import Info, Snapshot
 from pse_analysis.estimation.static.plausibility import implausible
 from pse_analysis.estimation.static.wls import WeightedLeastSquares, WlsSolution
 from pse_analysis.vocabulary import Reason, Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 HUBER = 1.5
 """Residual in units of σ beyond which a row pulls no harder, on the way to the first estimate."""

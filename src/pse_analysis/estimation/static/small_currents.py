@@ -7,15 +7,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.estimation.core.normal import NormalEquations
 from pse_analysis.measurement import IA, IM, MeasurementModel
 from pse_analysis.measurement.layout import metered_bus
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 SMALL = 10.0
 """Current, in units of σ, below which its direction counts as hardly known."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import ParameterError, Unobservable
 from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot, Voltages
 from pse_analysis.estimation.static.chi_square import Residuals, contradiction
@@ -16,9 +16,6 @@ from pse_analysis.estimation.static.wls import Reference, WeightedLeastSquares, 
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import SensorLayout
 from pse_analysis.vocabulary import Status
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 NO_ANGLE = "no angle is measured: angles are against the slack's, which stays where it was last"
 NO_REDUNDANCY = "no redundancy: nothing would tell a wrong measurement"

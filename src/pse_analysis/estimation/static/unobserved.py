@@ -6,19 +6,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.core.normal import Pins, with_held
 from pse_analysis.estimation.static.cold_start import ColdStart
 from pse_analysis.estimation.static.gauss_newton import Descent, GaussNewton, Problem, Singular
 from pse_analysis.estimation.static.observability import closing_rows, influence, named, open_states
 from pse_analysis.measurement import BUS, VM, MeasurementModel, P, Q, SensorLayout
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 NOMINAL_SIGMA = 0.05
 """σ of |V| about its nominal value where nothing is measured. [p.u.]"""

@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.core.normal import Factor, NormalEquations, Pins
 from pse_analysis.estimation.static.cold_start import ColdStart
@@ -30,11 +30,6 @@ from pse_analysis.estimation.static.unobserved import Gap, Unobserved
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import IA, IM, MeasurementModel, SensorLayout
 from pse_analysis.measurement.layout import metered_bus
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-
 
 ASSUMED = 1e-3
 """σ of a reference angle where nothing ever measured it. [rad]

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from pse_analysis.arrays import FloatArray
 from pse_analysis.drawing import BLUE, ORANGE, VERMILION
 from pse_analysis.figures.paper import (
     DOUBLE,
@@ -18,8 +19,6 @@ from pse_analysis.figures.paper import (
     styled,
     time_axis,
 )
-
-Array = npt.NDArray[np.float64]
 
 
 @styled
@@ -162,7 +161,7 @@ def gain_against_autocorrelation(table: pd.DataFrame, *, width: float = SINGLE) 
     return figure
 
 
-def _percent(share: npt.ArrayLike) -> Array:
+def _percent(share: npt.ArrayLike) -> FloatArray:
     """Percent, NaN instead of 0, which a logarithm has no place for."""
     v = 100.0 * np.asarray(share, dtype=float)
     return np.where(v > 0.0, v, np.nan)
