@@ -14,6 +14,7 @@ from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.bad_data.robust import Protection
 from pse_analysis.estimation.core.interface import Estimator
 from pse_analysis.estimation.filters import linearised, recursion, unscented
+from pse_analysis.estimation.filters.restart import ABSURD
 from pse_analysis.estimation.filters.unscented import Form, Scaling
 from pse_analysis.estimation.process import dynamics, sage_husa
 from pse_analysis.estimation.process.dynamics import HoltParams
@@ -21,6 +22,7 @@ from pse_analysis.estimation.process.sage_husa import VoltageNoise
 from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout
+from pse_analysis.parameters import Unbounded
 
 MOST_PASSES = 100
 """Linearisations of one step; what has not converged by then never does."""
@@ -44,6 +46,9 @@ class Composition:
         Whether it learns its process noise on the way.
     robustness : {"none", "trace", "per_channel"}
         How gross errors are met.
+    absurd : float
+        ηᵀS⁻¹η per measurement from which whatever filter leaves out what is far off; inf to believe
+        everything, as the filters of the papers do.
     protected : bool
         Whether a robust filter doubts its forecast after it has refused the same channels again
         and again.
@@ -60,6 +65,7 @@ class Composition:
     form: Form = "covariance"
     learning: Literal["none", "sage_husa"] = "none"
     robustness: Literal["none", "trace", "per_channel"] = "none"
+    absurd: Unbounded = ABSURD
     protected: bool = True
     passes: int = 1
     forgetting: float = FORGETTING
@@ -76,6 +82,8 @@ class Composition:
             raise ParameterError(
                 f"compose: expected 0 < forgetting < 1, received {self.forgetting}"
             )
+        if not self.absurd >= 1.0:
+            raise ParameterError(f"compose: expected absurd ≥ 1, received {self.absurd}")
         for key, needed in self._without_effect():
             raise ParameterError(f"compose.{key} has no effect here: drop it, or {needed}")
 
@@ -151,7 +159,7 @@ def compose(
         process,
         observation,
         made,
-        recursion.Robustness(judge, composition.protection if judges else None),
+        recursion.Robustness(judge, composition.protection if judges else None, composition.absurd),
     )
 
 

@@ -24,7 +24,7 @@ from pse_analysis.estimation.core.interface import (
 )
 from pse_analysis.estimation.filters.conditioning import Prior
 from pse_analysis.estimation.filters.protection import Recovery
-from pse_analysis.estimation.filters.restart import WIDER
+from pse_analysis.estimation.filters.restart import ABSURD, WIDER
 from pse_analysis.estimation.filters.square_root import carried
 from pse_analysis.estimation.filters.update import Observation, Update, update
 from pse_analysis.estimation.process.dynamics import Process
@@ -45,10 +45,13 @@ class Robustness:
     judge : GrossErrorTest
     protection : Protection, optional
         Against latching; None to go without.
+    absurd : float
+        See `pse_analysis.estimation.filters.restart.gross_errors`.
     """
 
     judge: GrossErrorTest = robust.none
     protection: Protection | None = None
+    absurd: float = ABSURD
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +164,16 @@ class GaussianFilter:
             judge = robust.per_channel
             detail = "snapshots were refused as a whole before: each channel is judged by itself"
         try:
-            done = update(self.model, self.observation, prior, snapshot, rows, state.alpha, judge)
+            done = update(
+                self.model,
+                self.observation,
+                prior,
+                snapshot,
+                rows,
+                state.alpha,
+                judge,
+                self.robustness.absurd,
+            )
             refusals, snapshot_rejections = self._refused(state, done, rows, judge)
             if self._recovery is not None and self._recovery.protection.latched(refusals, used):
                 restart, detail = self._recovery.find(prior, snapshot, rows, done, refusals[rows])

@@ -59,7 +59,9 @@ class RestartParams:
             )
 
 
-def gross_errors(eta: FloatArray, variance: FloatArray, nis: float) -> BoolArray:
+def gross_errors(
+    eta: FloatArray, variance: FloatArray, nis: float, absurd: float = ABSURD
+) -> BoolArray:
     """Which measurements are wrong beyond any doubt, before anything is believed.
 
     Parameters
@@ -68,6 +70,9 @@ def gross_errors(eta: FloatArray, variance: FloatArray, nis: float) -> BoolArray
         Innovation, and its S_ii.
     nis : float
         ηᵀS⁻¹η.
+    absurd : float
+        ηᵀS⁻¹η per measurement from which those that are far off are left out; whatever comes is
+        believed where it is infinite.
 
     Returns
     -------
@@ -80,7 +85,7 @@ def gross_errors(eta: FloatArray, variance: FloatArray, nis: float) -> BoolArray
         If many of them are far off: then it is the forecast that is wrong, or all of them.
     """
     m = len(eta)
-    if nis <= FAR**2:
+    if nis <= FAR**2 or absurd == np.inf:
         # None can be off by more.
         return np.zeros(m, dtype=bool)
     far = eta**2 > FAR**2 * variance
@@ -89,7 +94,7 @@ def gross_errors(eta: FloatArray, variance: FloatArray, nis: float) -> BoolArray
             f"the snapshot and the forecast exclude each other: {np.count_nonzero(far)} of {m} "
             f"measurements are off by more than {FAR:g} σ"
         )
-    return np.asarray(far & (nis > ABSURD * m))
+    return np.asarray(far & (nis > absurd * m))
 
 
 class Guarded(NamedTuple):

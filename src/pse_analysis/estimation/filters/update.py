@@ -14,7 +14,7 @@ from pse_analysis.estimation.bad_data.identification import Deletion, of_snapsho
 from pse_analysis.estimation.bad_data.robust import FORGETTING, GrossErrorTest, InnovationStats
 from pse_analysis.estimation.core.interface import Info, Snapshot
 from pse_analysis.estimation.filters.conditioning import Posterior, Predicted, Prior
-from pse_analysis.estimation.filters.restart import gross_errors
+from pse_analysis.estimation.filters.restart import ABSURD, gross_errors
 from pse_analysis.measurement import MeasurementModel, wrap
 from pse_analysis.vocabulary import Status
 
@@ -126,6 +126,7 @@ def update(
     rows: IntArray,
     alpha: float,
     judge: GrossErrorTest,
+    absurd: float = ABSURD,
 ) -> Update:
     """Condition a prior on some rows of a snapshot.
 
@@ -140,6 +141,8 @@ def update(
     alpha : float
         Memory of the observation.
     judge : GrossErrorTest
+    absurd : float
+        See `gross_errors`.
 
     Returns
     -------
@@ -154,7 +157,7 @@ def update(
     angular = model.angular[rows]
     at = prior.s
     converged = observation.passes == 1
-    verdict = partial(_inflation, judge, partial(of_snapshot, model, prior.x, rows))
+    verdict = partial(_inflation, judge, absurd, partial(of_snapshot, model, prior.x, rows))
     for passes in range(1, observation.passes + 1):  # noqa: B007 (reported below)
         predicted = observation.predict(prior, snapshot, rows, alpha, at)
         eta = snapshot.z[rows] - predicted.mean
@@ -173,10 +176,13 @@ def update(
 
 
 def _inflation(
-    judge: GrossErrorTest, alone: Callable[..., Deletion], found: InnovationStats
+    judge: GrossErrorTest,
+    absurd: float,
+    alone: Callable[..., Deletion],
+    found: InnovationStats,
 ) -> FloatArray:
     """A judgement that may ask the snapshot alone, of what is not wrong beyond any doubt."""
-    gross = gross_errors(found.innovation, found.variance, found.nis)
+    gross = gross_errors(found.innovation, found.variance, found.nis, absurd)
     if gross.any():
         return np.where(gross, FORGETTING * found.innovation**2 / found.noise, 0.0)
     return judge(replace(found, alone=partial(alone, found.innovation, found.noise)))
