@@ -142,7 +142,7 @@ def test_snapshots_that_tell_nothing_of_any_level_leave_them_near_the_start() ->
     memory = matching.begin()
     for _ in range(50):
         memory = matching.learn(memory, np.zeros((2, 3, 3)), np.zeros(3))
-    ratio = memory.level / covariance_matching.start
+    ratio = memory.level / matching.start
     assert ratio[0] == pytest.approx(ratio[1])
     assert 0.1 < ratio[0] < 10.0
 
@@ -209,7 +209,10 @@ def test_impossible_start_is_refused(start: np.ndarray, window: int) -> None:
 
 def test_only_the_kalman_filter_estimates_its_noise_from_innovations() -> None:
     assert Method.of("kf", "kalman", noise="innovation").noise == "innovation"
-    with pytest.raises(ParameterError, match="drop them"):
+    with pytest.raises(
+        ParameterError,
+        match='noise = "innovation" has no effect here: drop it, or take filter = "kalman"',
+    ):
         Method.of("f", "ukf", noise="innovation")
 
 

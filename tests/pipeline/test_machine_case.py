@@ -10,7 +10,7 @@ import pytest
 
 from pse_analysis import pipeline
 from pse_analysis.errors import ParameterError, TableError
-from pse_analysis.estimation import estimate
+from pse_analysis.estimation import Method, estimate
 from pse_analysis.machine import Machine
 from pse_analysis.parameters import build
 from pse_analysis.pipeline import runner
@@ -124,11 +124,11 @@ def test_without_torque_it_says_what_it_needs(
 def test_methods_of_a_grid_and_of_a_machine_do_not_mix(
     results: pipeline.Results, parameters: Parameters
 ) -> None:
-    wls = build(type(parameters.estimate.methods[0]), {"name": "wls", "filter": "wls"}, "methods")
-    with pytest.raises(ParameterError, match="a grid's, but the case is about machine/1"):
+    wls = build(Method, {"name": "wls", "filter": "wls"}, "methods")
+    with pytest.raises(ParameterError, match="estimates a grid, but the case is about machine/1"):
         estimate(results["aligned"], results["channels"], results.machine, parameters.study, wls)
-    with pytest.raises(ParameterError, match="belong together"):
-        build(type(wls), {"name": "o", "filter": "observer"}, "methods")
+    with pytest.raises(ParameterError, match="key 'observer' is missing"):
+        build(Method, {"name": "o", "filter": "observer"}, "methods")
 
 
 def test_telemetry_of_ones_own_machine_is_taken_in(results: pipeline.Results) -> None:

@@ -62,7 +62,8 @@ class Setting:
         if isinstance(self.model, Network):
             return self.model
         raise ParameterError(
-            'this method estimates a grid, but the case is about a machine: use filter = "observer"'
+            f"this method estimates a grid, but the case is about {self.model.element}: use "
+            'filter = "observer"'
         )
 
 
