@@ -252,7 +252,16 @@ def test_variants_stand_in_the_tables_as_methods() -> None:
 
 
 def test_estimators_without_dynamics_are_not_smoothed() -> None:
-    nothing = Estimator("f", lambda _s: (None, Info.nothing(8, Status.OK)), None, None)  # type: ignore[arg-type]
+    info = Info.nothing(2 * N, Status.NOT_CONVERGED)
+    nothing = Estimator(
+        "f", lambda _s: (None, info), lambda _state, _s: (None, info), lambda _: None
+    )
+    taken = list(walk(phasors(), 3, SEED, 0.0).snapshots())
+    found = variants.run(nothing, taken, NETWORK, phasors(), smooth=True, ahead=(1,))
+    assert found.estimated["value"].isna().all()
+    count = found.steps.groupby("method").size()
+    assert count.to_dict() == {"f": 3, "f_smoothed": 3, "f_ahead_1": 2}
+    assert set(found.steps["status"]) == {"not_converged"}
     with pytest.raises(TypeError, match="does not say how its state moves"):
         Trail(nothing, []).smoothed()
 

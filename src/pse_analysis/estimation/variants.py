@@ -51,7 +51,8 @@ def run(
     model : Network or Machine
     layout : SensorLayout
     smooth : bool
-        Whether every instant is estimated again from all of them.
+        Whether every instant is estimated again from all of them; there is no such estimate where
+        the estimator does not say how its state moves.
     ahead : tuple of int
         Steps ahead of which there are to be forecasts.
     trial : int
@@ -94,9 +95,9 @@ def run(
     made = [own]
     m, status = len(layout), [Status(one) for one in own.steps["status"]]
     known = [None] * len(snapshots) if truth is None else list(truth)
-    if smooth and estimator.dynamics is not None:
+    if smooth:
         begun = time.perf_counter()
-        back = trail.smoothed()
+        back = trail.smoothed() if estimator.dynamics else [None] * len(snapshots)
         seconds = time.perf_counter() - begun
         made.append(
             driver.derived(
