@@ -63,6 +63,7 @@ def estimated(
     score = (
         residual[residual.used].assign(z=lambda r: r.innovation / r.sigma_innovation)
     ).pivot_table(index="time_utc", columns=["method", "channel"], values="z")
+    named = set(score.columns.get_level_values("method"))
     errors = VoltageErrors.of(vm, true, network)
 
     buses = []
@@ -77,7 +78,8 @@ def estimated(
             [-6.0, 6.0],
             legend=False,
         )
-        for name in methods
+        # Smoothed estimates and forecasts have no innovations, nor has a method without estimates.
+        for name in ([n for n in methods if n in named] or methods)
     ]
     top = float(np.nanquantile(nis, 0.995)) if nis.size and nis.notna().any().any() else 1.0
     graphs = errors.views("grid")
@@ -102,7 +104,7 @@ def estimated(
         for element in chosen:
             _draw_bus(stream, element, vm, true, measured, methods)
         for name, colour in methods.items():
-            if name in score.columns.get_level_values("method"):
+            if name in named:
                 one = score[name]
                 where = marks.named_path("normalised", name)
                 marks.dots(stream, where, one, [colour] * one.shape[1], 1.2)
@@ -140,7 +142,7 @@ def _draw_nis(
     marks.lines(stream, "nis/methods", nis, [methods[name] for name in nis.columns])
     dof = step.pivot_table(index="time_utc", columns="method", values="dof")
     groups: dict[tuple[float, ...], list[str]] = {}
-    for name in dof.columns:
+    for name in (one for one in dof.columns if (dof[one] > 0).any()):
         groups.setdefault(tuple(dof[name].fillna(0.0)), []).append(str(name))
     for number, names in enumerate(groups.values()):
         m = dof[names[0]].where(dof[names[0]] > 0)
@@ -185,7 +187,7 @@ def _estimated_text(
             (
                 str(name),
                 f"{nis[name].mean():.2f}" if name in nis else "–",
-                f"{100 * inside:.0f} %",
+                f"{100 * inside:.0f} %" if np.isfinite(inside) else "–",
                 f"{int((one.status != 'ok').sum())} of {len(one)}",
                 f"{1e3 * one.seconds.mean():.1f} ms",
             )
