@@ -87,7 +87,7 @@ def test_forecast_still_tells_a_wrong_meter_where_nothing_else_does() -> None:
     restart, detail = Recovery(model, Protection()).find(prior, snapshot, rows, done, refusals)
     assert restart is not None
     assert "widened" in detail
-    named = rows[restart.told.inflation > 0]
+    named = rows[restart.report.inflation > 0]
     assert wrong in named
     assert len(named) <= 2
     off, end = np.abs(restart.x - moved)[: b.network.n_bus], b.network.bus("26")

@@ -10,7 +10,7 @@ from qu_bench import Bench, gross_errors, real_day, still
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation.bad_data import robust
-from pse_analysis.estimation.bad_data.robust import MARGIN, InnovationStats, Protection, gate
+from pse_analysis.estimation.bad_data.robust import GATE_SQ, InnovationStats, Protection, gate
 from pse_analysis.estimation.core.cholesky import Root
 from pse_analysis.estimation.core.run import run
 from pse_analysis.estimation.core.run_arrays import EPOCH, ArrayRun, run_arrays
@@ -51,7 +51,7 @@ def test_gate_lets_good_snapshots_pass_as_often_as_it_says() -> None:
     assert outlying.mean() == pytest.approx(1e-3, abs=3e-4)
 
 
-@pytest.mark.parametrize("judge", robust.JUDGES.values(), ids=robust.JUDGES)
+@pytest.mark.parametrize("judge", robust.GROSS_ERROR_TESTS.values(), ids=robust.GROSS_ERROR_TESTS)
 def test_good_snapshot_is_believed(judge: robust.GrossErrorTest) -> None:
     found = suspicion(np.random.default_rng(SEED))
     assert found.nis < gate(12)[0]
@@ -102,7 +102,7 @@ def test_error_that_the_forecasts_uncertainty_covers_is_found_by_the_other_chann
     eta = np.full(20, 10.0)
     eta[4] += 8.0
     found = of(eta, S, noise)
-    assert eta[4] ** 2 < MARGIN * S[4, 4]
+    assert eta[4] ** 2 < GATE_SQ * S[4, 4]
     assert tuple(np.flatnonzero(robust.per_channel(found))) == (4,)
 
 
@@ -113,7 +113,7 @@ def test_suspects_that_the_other_channels_confirm_are_cleared() -> None:
     eta[[2, 6]] = 4.5
     eta[11] = 40.0
     found = of(eta, S, np.ones(20))
-    assert (eta[[2, 6]] ** 2 > MARGIN * found.variance[[2, 6]]).all()
+    assert (eta[[2, 6]] ** 2 > GATE_SQ * found.variance[[2, 6]]).all()
     assert tuple(np.flatnonzero(robust.per_channel(found))) == (11,)
 
 

@@ -12,7 +12,13 @@ from tests.endurance import tiny_case
 
 from pse_analysis.errors import ParameterError
 from pse_analysis.estimation import Method, Record, Setting, variants
-from pse_analysis.estimation.core.interface import Estimate, Estimator, Info, Transition
+from pse_analysis.estimation.core.interface import (
+    Estimate,
+    Estimator,
+    Info,
+    Snapshot,
+    Transition,
+)
 from pse_analysis.estimation.core.run import run
 from pse_analysis.estimation.filters.smoother import Ahead, Smoothed, Trail, look_back
 from pse_analysis.measurement import SensorLayout
@@ -270,3 +276,42 @@ def test_estimators_without_dynamics_are_not_smoothed() -> None:
 def test_steps_ahead_that_make_no_sense_are_refused(ahead: list[int]) -> None:
     with pytest.raises(ParameterError, match="expected ahead to list different numbers"):
         Method.of("f", "ekf", ahead=ahead)
+
+
+def test_a_state_that_cannot_be_moved_ends_no_run() -> None:
+    """Where the smoother meets numbers that allow nothing, an estimate stays the filter's own."""
+    layout = phasors()
+    taken = list(walk(layout, 9, SEED, 0.0).snapshots())
+    plain = made(layout, filter="ekf")
+    assert plain.dynamics is not None
+    predict = plain.dynamics.predict
+
+    def fails(state: object, snapshot: Snapshot) -> Transition:
+        if snapshot.time == taken[5].time:
+            raise np.linalg.LinAlgError("covariance is not positive definite")
+        return predict(state, snapshot)
+
+    estimator = plain._replace(dynamics=plain.dynamics._replace(predict=fails))
+    found = variants.run(estimator, taken, NETWORK, layout, smooth=True)
+    value = found.estimated.pivot_table(
+        index=["time_utc", "element", "quantity"], columns="method", values="value"
+    )
+    same = (value["f"] == value["f_smoothed"]).groupby(level="time_utc").all()
+    # The last instant has no later one, and that before the failure cannot look back on any.
+    assert np.flatnonzero(same).tolist() == [4, 8]
+
+
+def test_a_forecast_that_fails_ends_no_run() -> None:
+    layout = phasors()
+    taken = list(walk(layout, 5, SEED, 0.0).snapshots())
+    plain = made(layout, filter="ekf")
+
+    def step(state: object, snapshot: Snapshot) -> tuple[object, Info]:
+        if not snapshot.available.any():
+            raise FloatingPointError("overflow")
+        return plain.step(state, snapshot)
+
+    found = variants.run(plain._replace(step=step), taken, NETWORK, layout, ahead=(1,))
+    ahead = found.estimated[found.estimated["method"] == "f_ahead_1"]
+    assert len(ahead) == 4 * 2 * N
+    assert ahead["value"].isna().all()

@@ -167,6 +167,7 @@ class TestSpace:
 
     def test_less_than_is_free_is_not(self, tmp_path: Path) -> None:
         space.require(tmp_path / "not" / "there", 1, "the stage")
+        assert not (tmp_path / "not").exists()
 
     def test_small_case_needs_about_what_it_needed(self, whole: Place) -> None:
         raw = runner.Store(whole.processed).raw_files()

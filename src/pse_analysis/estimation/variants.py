@@ -67,21 +67,18 @@ def run(
     """
     trail, forecasts = Trail(estimator, snapshots), Ahead(estimator, snapshots, ahead)
     infos: list[Info] = []
-    lost = [0.0]
+    forecasting = [0.0]
 
-    def timed(see: Watch) -> Watch:
-        def look(k: int, state: object, info: Info) -> None:
-            begun = time.perf_counter()
-            see(k, state, info)
-            lost[0] += time.perf_counter() - begun
-
-        return look
+    def forecast(k: int, state: object, info: Info) -> None:
+        begun = time.perf_counter()
+        forecasts.watch(k, state, info)
+        forecasting[0] += time.perf_counter() - begun
 
     watch: list[Watch] = [lambda _k, _state, info: infos.append(info)]
     if smooth and estimator.dynamics is not None:
-        watch.append(timed(trail.watch))
+        watch.append(trail.watch)
     if ahead:
-        watch.append(timed(forecasts.watch))
+        watch.append(forecast)
     own = driver.run(
         estimator,
         iter(snapshots),
@@ -123,7 +120,7 @@ def run(
                     for k, s in enumerate(snapshots)
                     if k >= steps
                 ],
-                lost[0] / len(ahead),
+                forecasting[0] / len(ahead),
                 model,
                 layout,
             )

@@ -240,8 +240,8 @@ def _values(value: pd.Series, row: npt.NDArray[np.intp], channels: pd.DataFrame)
                 [np.nan if v is None or v is pd.NA else v for v in value], dtype=np.complex128
             )
         except (TypeError, ValueError, OverflowError):
-            pass
-        else:
+            array = None  # No numbers: refused below, with an example.
+        if array is not None:
             if array.ndim != 1:
                 raise TableError(
                     "telemetry: column 'value' holds lists or arrays, e.g. "

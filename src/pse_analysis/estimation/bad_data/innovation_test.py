@@ -103,9 +103,9 @@ def refuse(params: InnovationTest | None = None) -> Refuse:
         y = M @ innovation
         for _ in range(int(params.largest_share * m)):
             variance = np.where(out, np.inf, np.diagonal(M))
-            suspicion = np.abs(y) / (bound * np.sqrt(variance))
-            worst = int(suspicion.argmax())
-            if suspicion[worst] <= 1.0:
+            excess = np.abs(y) / (bound * np.sqrt(variance))
+            worst = int(excess.argmax())
+            if excess[worst] <= 1.0:
                 return out
             out[worst] = True
             column, own = M[:, worst].copy(), M[worst, worst]

@@ -29,15 +29,15 @@ FORGETTING = 1e8
 """A measurement with a gross error η that is to be left out gets the noise of so many η²."""
 RAISE, MOST_RAISES = 4.0, 20
 """Factor by which φ is raised, and how often at most."""
-MARGIN = 9.0
+GATE_SQ = 9.0
 """g: squared deviation, in units of its variance, up to which a channel is fully believed."""
 MIN_CONFIRMED = 2
-"""Fewest accused channels that a wrong forecast is believed to have misled.
+"""Fewest named channels that a wrong forecast is believed to have misled.
 
 A movement is seen by several channels. A lone one that the forecast contradicts and few others
 confirm is as often wrong, together with one of these.
 """
-FAR = 6.0
+GROSS_ERROR_SIGMAS = 6.0
 """Deviation, in units of its σ, from which a reading is no noise whatever the others say."""
 
 
@@ -102,8 +102,8 @@ def trace(found: InnovationStats) -> FloatArray:
     -----
     Eqs. (32) and (33) of [qu2018]. Without the gate a perfectly tuned filter would inflate its
     noise half of the time. The traces add p.u. and rad, and where a loose forecast of the powers
-    fills tr S, the print finds nothing to inflate although a channel is `FAR` off: φ is then
-    raised until the snapshot passes the gate.
+    fills tr S, the print finds nothing to inflate although a channel is off by
+    `GROSS_ERROR_SIGMAS`: φ is then raised until the snapshot passes the gate.
     """
     m = len(found.innovation)
     bound = gate(m)[0]
@@ -111,7 +111,7 @@ def trace(found: InnovationStats) -> FloatArray:
         return np.zeros(m)
     excess = found.innovation @ found.innovation - found.variance.sum()
     phi = max(0.0, float(excess / found.noise.sum()))
-    if (found.innovation**2 <= FAR**2 * found.variance).all():
+    if (found.innovation**2 <= GROSS_ERROR_SIGMAS**2 * found.variance).all():
         return np.full(m, phi)
     for _ in range(MOST_RAISES):
         if _passes(found, phi, bound):
@@ -159,10 +159,9 @@ def per_channel(found: InnovationStats) -> FloatArray:
     Beyond [qu2018]. The search (`Deletion.search`) starts from all that the forecast alone does not
     fully believe, which a gross error elsewhere cannot hide, and ends where no channel is worth
     leaving out, taking back or exchanging, at the price of the gate's bound on one channel. Then
-    the accused are heard: a channel is acquitted if the rest of the snapshot *without the forecast*
-    agrees with it and rules the error out that it is accused of, and not it alone
-    (`MIN_CONFIRMED`). So a movement of the load that many channels see is taken for one,
-    whatever little the process noise allows.
+    a named channel is confirmed if the rest of the snapshot *without the forecast* agrees with it
+    and rules out its estimated error, and not that channel alone (`MIN_CONFIRMED`). So a movement
+    of the load that many channels see is taken for one, whatever little the process noise allows.
     """
     eta, noise = found.innovation, found.noise
     total, largest = gate(len(eta))
@@ -171,31 +170,31 @@ def per_channel(found: InnovationStats) -> FloatArray:
     # Of S⁻¹ only the diagonal and a few columns are asked for.
     weighted = blas.dtrsv(found.root.chol, found.white, lower=1, trans=1)
     deletion = Deletion(weighted, found.root.precision(), found.root.precision_columns, found.nis)
-    named = np.flatnonzero(deletion.search(eta**2 > MARGIN * found.variance, largest))
+    named = np.flatnonzero(deletion.search(eta**2 > GATE_SQ * found.variance, largest))
     error, variance = deletion.error_estimate(named)
     if len(named) and found.alone is not None:
-        acquitted = _confirmed_by_snapshot(found.alone(named), error, largest)
-        if acquitted.any():
-            named = named[~acquitted]
+        right = _confirmed_by_snapshot(found.alone(named), error, largest)
+        if right.any():
+            named = named[~right]
             error, variance = deletion.error_estimate(named)
     phi = np.zeros(len(eta))
-    phi[named] = np.maximum(error**2 - MARGIN * variance, 0.0) / noise[named]
+    phi[named] = np.maximum(error**2 - GATE_SQ * variance, 0.0) / noise[named]
     return phi
 
 
-def _confirmed_by_snapshot(heard: Deletion, error: FloatArray, price: float) -> BoolArray:
-    """Which of the accused the snapshot without the forecast confirms.
+def _confirmed_by_snapshot(alone: Deletion, error: FloatArray, price: float) -> BoolArray:
+    """Returns which named channels the snapshot without the forecast confirms. (k,)
 
-    ``error`` (k,) is what each of them is accused of.
+    ``error`` (k,) is the estimated error of each of them.
     """
-    contradicted = heard.search(np.ones(len(error), dtype=bool), price, most=1.0)
+    contradicted = alone.search(np.ones(len(error), dtype=bool), price, most=1.0)
     if contradicted.all():
         return ~contradicted
-    standing = heard.without(contradicted)
-    confirmed = ~contradicted & (standing.ratio < MARGIN)
-    excluded = (standing.error - error) ** 2 > price * standing.variance
-    acquitted = np.asarray(confirmed & excluded)
-    return acquitted & (np.count_nonzero(acquitted) >= MIN_CONFIRMED)
+    left = alone.without(contradicted)
+    confirmed = ~contradicted & (left.ratio < GATE_SQ)
+    excluded = (left.error - error) ** 2 > price * left.variance
+    both = np.asarray(confirmed & excluded)
+    return both & (np.count_nonzero(both) >= MIN_CONFIRMED)
 
 
 def left_out(refuse: Refuse) -> GrossErrorTest:
@@ -209,7 +208,11 @@ def left_out(refuse: Refuse) -> GrossErrorTest:
     return judge
 
 
-JUDGES: dict[str, GrossErrorTest] = {"none": none, "trace": trace, "per_channel": per_channel}
+GROSS_ERROR_TESTS: dict[str, GrossErrorTest] = {
+    "none": none,
+    "trace": trace,
+    "per_channel": per_channel,
+}
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,11 @@ def compose(
             "likelihood": unscented.by_likelihood,
         }[composition.scaling]
         observation = scaled(model, composition.points, composition.form)
-    judge = robust.JUDGES[composition.robustness] if refuse is None else robust.left_out(refuse)
+    judge = (
+        robust.GROSS_ERROR_TESTS[composition.robustness]
+        if refuse is None
+        else robust.left_out(refuse)
+    )
     judges = composition.robustness != "none" and composition.protected
     return recursion.GaussianFilter(
         model,

@@ -17,7 +17,7 @@ import numpy as np
 from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.estimation.bad_data import robust
 from pse_analysis.estimation.bad_data.identification import PRIOR_SIGMA_PU
-from pse_analysis.estimation.bad_data.robust import MARGIN, Protection
+from pse_analysis.estimation.bad_data.robust import GATE_SQ, Protection
 from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.estimation.filters.conditioning import Prior
 from pse_analysis.estimation.filters.linearised import linearised
@@ -39,12 +39,12 @@ class Restart(NamedTuple):
         [θ; |V|]. [rad, p.u.]
     P : (n, n) ndarray
         Covariance of its estimated entries.
-    told : UpdateReport
+    report : UpdateReport
     """
 
     x: FloatArray
     P: FloatArray
-    told: UpdateReport
+    report: UpdateReport
 
 
 class Recovery:
@@ -107,7 +107,7 @@ class Recovery:
         done = update(self.model, self._observation, wide, snapshot, rows, 0.0, robust.per_channel)
         found, n = done.found, prior.n
         if _reconciled(found.inflation > 0, stuck):
-            restart = Restart(prior.filled(found.s), found.P[:n, :n], done.told)
+            restart = Restart(prior.filled(found.s), found.P[:n, :n], done.report)
             return restart, f"{cause}: the forecast was widened in their directions"
         alone, told = begin(self._least_squares, snapshot)
         if alone is None:
@@ -150,7 +150,7 @@ class Recovery:
         no         channel stands out, all of P is as much too small.
         """
         eta, found = refused.innovation, refused.found
-        out = np.flatnonzero(stuck & (eta**2 > MARGIN * found.variance))
+        out = np.flatnonzero(stuck & (eta**2 > GATE_SQ * found.variance))
         H = self.model.jacobian(prior.x)[rows[out]]
         along = np.asarray(H @ prior.P[: prior.n])
         own = np.asarray(H.multiply(along[:, : prior.n]).sum(axis=1)).ravel()

@@ -186,7 +186,7 @@ class GaussianFilter:
                         alpha=done.alpha,
                         snapshot_rejections=snapshot_rejections,
                     )
-                    return again, restart.told.info(Status.RESTARTED, snapshot, rows, detail)
+                    return again, restart.report.info(Status.RESTARTED, snapshot, rows, detail)
                 # Wrong meters stay wrong whatever the forecast says; ask again after a while.
                 refusals[:] = 0
         except np.linalg.LinAlgError as error:
@@ -209,7 +209,7 @@ class GaussianFilter:
             snapshot_rejections,
             found.chol_P,
         )
-        return after, done.told.info(status, snapshot, rows, detail)
+        return after, done.report.info(status, snapshot, rows, detail)
 
     def _moved(self, state: GaussianState, time: np.datetime64) -> tuple[Prior, _Moved]:
         """The state at an instant before its measurements."""
@@ -255,7 +255,7 @@ class GaussianFilter:
         found = done.found
         open_gate = found.nis > robust.gate(len(rows))[0]
         if judge is robust.trace:
-            refused = done.innovation**2 > robust.MARGIN * found.variance
+            refused = done.innovation**2 > robust.GATE_SQ * found.variance
         else:
             # What contradicts and was believed all the same was not understood either.
             refused = (found.inflation > 0) | open_gate

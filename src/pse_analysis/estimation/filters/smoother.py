@@ -18,6 +18,7 @@ from scipy.linalg import solve_triangular
 from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.core.cholesky import cholesky, solve
 from pse_analysis.estimation.core.interface import (
+    FAILURES,
     Dynamics,
     Estimate,
     Estimator,
@@ -108,16 +109,24 @@ class Trail:
         follows = self._before is not None and state is not None
         follows = follows and info.status is not Status.RESTARTED
         if follows:
-            dynamics = _dynamics(self.estimator)
-            ahead = dynamics.predict(self._before, self.snapshots[k]).covariance
-            after = dynamics.belief(state)[1]
-            follows = len(ahead) == len(after) and bool(
-                (np.diagonal(after) <= WIDENED * np.diagonal(ahead)).all()
-            )
+            follows = self._narrowed(k, state)
         self._follows.append(follows)
         if k % self.span == 0 or not follows:
             self._kept[k] = state
         self._before = state
+
+    def _narrowed(self, k: int, state: Any) -> bool:
+        """Whether a state is no less certain than what was expected of it before the instant."""
+        dynamics = _dynamics(self.estimator)
+        try:
+            ahead = dynamics.predict(self._before, self.snapshots[k]).covariance
+        except FAILURES:
+            # A state that cannot be moved has no later one that looks back on it.
+            return False
+        after = dynamics.belief(state)[1]
+        return len(ahead) == len(after) and bool(
+            (np.diagonal(after) <= WIDENED * np.diagonal(ahead)).all()
+        )
 
     def _segment(self, first: int, last: int) -> list[Any]:
         """States of the instants first … last; the first is a kept one."""
@@ -143,14 +152,25 @@ class Trail:
                     later = None
                     continue
                 belief = dynamics.belief(state)
+                alone = Smoothed(*belief)
                 if later is None or not self._follows[k + 1]:
-                    later = Smoothed(*belief)
+                    later = alone
                 else:
-                    transition = dynamics.predict(state, self.snapshots[k + 1])
-                    later = look_back(belief, transition, later, dynamics.difference)
+                    later = self._looked_back(k, state, later, alone)
                 out[k] = dynamics.read(state, later.s, later.P)
             last = first - 1
         return out
+
+    def _looked_back(self, k: int, state: Any, later: Smoothed, alone: Smoothed) -> Smoothed:
+        """A state given the later ones; by itself where their numbers do not allow more."""
+        dynamics = _dynamics(self.estimator)
+        try:
+            transition = dynamics.predict(state, self.snapshots[k + 1])
+            found = look_back(alone, transition, later, dynamics.difference)
+        except FAILURES:
+            return alone
+        sound = np.isfinite(found.s).all() and np.isfinite(found.P).all()
+        return found if sound and (np.diagonal(found.P) >= 0).all() else alone
 
 
 @dataclass
@@ -175,7 +195,11 @@ class Ahead:
         for ahead in range(1, max(self.steps) + 1):
             if state is None or k + ahead >= len(self.snapshots):
                 return
-            state, _ = self.estimator.step(state, self.snapshots[k + ahead].silent())
+            try:
+                state, _ = self.estimator.step(state, self.snapshots[k + ahead].silent())
+            except FAILURES:
+                # Nothing can be said of this instant, nor of those behind it.
+                return
             if ahead in self.steps and state is not None:
                 made = self.estimator.read(state)
                 if made is not None:

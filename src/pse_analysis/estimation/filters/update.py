@@ -49,7 +49,7 @@ class Observation(NamedTuple):
 
 
 class UpdateReport(NamedTuple):
-    """What is to be told of a snapshot.
+    """Report of how a snapshot was taken in.
 
     Attributes
     ----------
@@ -110,8 +110,8 @@ class Update(NamedTuple):
     converged: bool
 
     @property
-    def told(self) -> UpdateReport:
-        """What is to be told of it."""
+    def report(self) -> UpdateReport:
+        """The report of the update."""
         found, dof = self.found, len(self.innovation)
         return UpdateReport(
             self.iterations, found.nis, dof, self.innovation, found.variance, found.inflation

@@ -9,7 +9,7 @@ import numpy as np
 from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import Unobservable
 from pse_analysis.estimation.bad_data.identification import of_snapshot
-from pse_analysis.estimation.bad_data.robust import FAR, gate
+from pse_analysis.estimation.bad_data.robust import GROSS_ERROR_SIGMAS, gate
 from pse_analysis.estimation.core.interface import Info, Snapshot
 from pse_analysis.estimation.static.plausibility import implausible
 from pse_analysis.estimation.static.wls import WeightedLeastSquares, WlsSolution
@@ -64,7 +64,7 @@ def robust_wls(
     if not np.isfinite(rough.x).all():
         return solution, left_out
     x = rough.x
-    left_out = available & (np.abs(wls.model.residual(z, x)) > FAR * sigma)
+    left_out = available & (np.abs(wls.model.residual(z, x)) > GROSS_ERROR_SIGMAS * sigma)
     for _ in range(MAX_ROUNDS):
         before = left_out
         left_out, unseen = _contradicting(wls, x, z, sigma, available, before)
