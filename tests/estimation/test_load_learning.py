@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pse_analysis.estimation.core.snapshots import Record
-from pse_analysis.estimation.process.learn_from_history import learn_load, learn_source
+from pse_analysis.estimation.process.learn_from_history import learn_load
+from pse_analysis.estimation.process.learn_source import learn_source
 from pse_analysis.grid import library
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import solve

@@ -17,6 +17,9 @@ from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray
 from pse_analysis.estimation.process.dynamics import Process
 from pse_analysis.measurement.rectangular import Linear, Memo, Pattern
 
+SLIGHT_TURN = 1e-3
+"""Largest factor, apart from 1, on voltages that leaves their covariance as it is."""
+
 
 class Belief(NamedTuple):
     """Mean and covariance of a lagged state.
@@ -241,6 +244,35 @@ class AugmentedState:
         known = x[: kept * n].reshape(kept, 2, n // 2)
         out = instants.copy()
         out[:, :kept] = (known[:, 0] + 1j * known[:, 1]).T
+        return out
+
+    def turned(self, before: Belief, after: FloatArray, P: FloatArray) -> Belief:
+        """A corrected state in which what goes across a voltage has turned it.
+
+        Added to a voltage, a correction by an angle δ would lengthen it by δ²/2. Its covariance
+        turns with it. What a process adds to the present is left as it is.
+        """
+        n, kept = self.n // 2, self.past * self.n
+        old, new = (s[:kept].reshape(-1, 2, n) for s in (before.x, after))
+        voltage = old[:, 0] + 1j * old[:, 1]
+        change = (new[:, 0] + 1j * new[:, 1]) / voltage - 1.0
+        turn = (1.0 + change.real) * np.exp(1j * change.imag)
+        voltage = turn * voltage
+        x = after.copy()
+        x[:kept] = np.stack([voltage.real, voltage.imag], axis=1).ravel()
+        if np.abs(turn - 1.0).max(initial=0.0) > SLIGHT_TURN:
+            P = self._along(self._along(P, turn).T, turn)
+            P = 0.5 * (P + P.T)
+        return Belief(x, P, before.memory)
+
+    def _along(self, P: FloatArray, turn: ComplexArray) -> FloatArray:
+        """Rows of [e; f] of the present and the past multiplied by complex factors (L, N)."""
+        out = P.copy()
+        rows = P[: self.past * self.n].reshape(self.past, 2, self.n // 2, -1)
+        here = out[: self.past * self.n].reshape(rows.shape)
+        real, imaginary = turn.real[..., None], turn.imag[..., None]
+        here[:, 0] = real * rows[:, 0] - imaginary * rows[:, 1]
+        here[:, 1] = imaginary * rows[:, 0] + real * rows[:, 1]
         return out
 
     def expect(

@@ -173,7 +173,10 @@ class KalmanFilter:
             moving = 1.0 if found.reach is None else found.reach.moving
             response = covariance_matching.responses(shapes, found.plane, moving, solved.chol_S)
             learnt = self._noise.learn(learnt, response, solved.white)
-        return KalmanState(after.s, after.P, prior.memory, learnt), Info(
+        corrected = Belief(after.s, after.P, prior.memory)
+        if self.linearisation == "derivative":
+            corrected = self.lagged.turned(prior, after.s, after.P)
+        return KalmanState(*corrected, learnt), Info(
             Status.OK,
             passes,
             after.nis,

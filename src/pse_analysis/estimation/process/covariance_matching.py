@@ -1,9 +1,10 @@
 """Process noise estimated from a filter's own innovations, by covariance matching.
 
 Q = Σ θ_k B_k B_kᵀ has a few known shapes, and the levels θ are estimated: single loads that move on
-their own, all loads together, the source. Whatever the levels, Q belongs to the grid and is
-semi-definite, and some hours hold enough innovations for so few numbers. What is passed on is not
-the best fit of a level but the mean of what it may be, so that P knows of the doubt.
+their own, all loads together, the source, other held voltages. Whatever the levels, Q belongs to
+the grid and is semi-definite, and some hours hold enough innovations for so few numbers. What is
+passed on is not the best fit of a level but the mean of what it may be, so that P knows of the
+doubt.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from pse_analysis.estimation.process.load_noise import Sensitivity, at_least, in
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, P, Q, SensorLayout
 
-START = np.array([0.02, 0.02, 1e-3]) ** 2
-"""Levels before anything was seen: (share of nominal load)² alone and together, and p.u.²"""
+START = np.array([0.02, 0.02, 1e-3, 1e-4]) ** 2
+"""Levels before anything was seen: (share of nominal load)² alone and together, and p.u.² of the
+references and of other held voltages, where there are any."""
 WINDOW = 18
 """Steps after which the weight of an innovation has faded to 1/e.
 
@@ -146,7 +148,7 @@ class CovarianceMatching:
 def of_loads(
     network: Network, metered: FloatArray | None = None, window: float = WINDOW
 ) -> CovarianceMatching:
-    """Loads alone in proportion to their size, all loads together, and the source.
+    """Loads alone in proportion to their size, all loads together, references, other held voltages.
 
     Parameters
     ----------
@@ -177,17 +179,17 @@ def of_loads(
         )
 
     least = at_least(size)
+    reference = np.isin(sensitivity.held, network.references)
+    groups = [group for group in (reference, ~reference) if group.any()]
 
     def halves(voltage: ComplexArray) -> tuple[FloatArray, ...]:
         at_source, frame = in_frame(voltage, network.slack)
         by_input, by_voltage = moves(at_source)
-        return (
-            turned_rows(by_input * least, frame),
-            turned_rows((by_input @ size)[:, None], frame),
-            turned_rows(by_voltage, frame),
-        )
+        shapes = [by_input * least, (by_input @ size)[:, None]]
+        shapes += [by_voltage[:, group] for group in groups]
+        return tuple(turned_rows(shape, frame) for shape in shapes)
 
-    return CovarianceMatching(halves, START, window)
+    return CovarianceMatching(halves, START[: 2 + len(groups)], window)
 
 
 def responses(

@@ -6,22 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, optimize, signal
+from scipy import linalg
 
 from pse_analysis.arrays import FloatArray
 from pse_analysis.estimation.core.snapshots import Record
-from pse_analysis.estimation.process.load_noise import LoadStatistics, Sensitivity, to_polar
+from pse_analysis.estimation.process.learn_source import learn_held
+from pse_analysis.estimation.process.load_noise import LoadStatistics
 from pse_analysis.grid.network import Network
-from pse_analysis.grid.power_flow import solve
-from pse_analysis.measurement import BUS, VM, P, Q, SensorLayout, standard_deviation
+from pse_analysis.measurement import BUS, P, Q, SensorLayout, standard_deviation
 
 DAY_S = 86400.0
 FEWEST_CHANGES = 24
 """Changes below which no correlation is learnt."""
 SHRINKAGE = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 """Shares of the mean correlation that are tried."""
-USUAL_SOURCE = 1e-3
-"""σ of the source voltage's change per step where history tells nothing. [p.u.]"""
 
 
 def learn_load(
@@ -47,7 +45,8 @@ def learn_load(
     slot_s, bandwidth_s : float
         Slots of the day, and how far (Gaussian) each one looks at its neighbours. [s]
     source : float, optional
-        σ of the source voltage's change per step; learnt if not given. [p.u.]
+        σ of the change per step of the voltage of every reference; learnt if not given, as those
+        of other held voltages are. [p.u.]
 
     Returns
     -------
@@ -78,9 +77,8 @@ def learn_load(
         deviation[:, meters.place] = np.sqrt(moving / meters.span_s * step_s)
         correlation[np.ix_(meters.place, meters.place)] = within
     _fill_unmetered(deviation, network)
-    if source is None:
-        source = learn_source(history, layout, network, step_s)
-    return LoadStatistics(deviation, correlation, source, slot_s)
+    held = learn_held(history, layout, network, step_s, source)
+    return LoadStatistics(deviation, correlation, held, slot_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,80 +241,3 @@ def _fill_unmetered(deviation: FloatArray, network: Network) -> None:
     )
     rest = np.flatnonzero(~metered)
     deviation[:, rest] = relative[:, None] * nominal[rest]
-
-
-def learn_source(history: Record, layout: SensorLayout, network: Network, step_s: float) -> float:
-    """Learn σ of the source voltage's change per step as a local level under white noise.
-
-    Every voltage reading, less the part that the metered injections explain (by the sensitivities
-    at the nominal state), reads the source; their mean follows a random walk plus noise. The ratio
-    of the two variances maximises the likelihood, in which the scale is concentrated out: what the
-    meters between two samples do not tell is then counted as noise, not as movement of the source.
-
-    Parameters
-    ----------
-    history : Record
-    layout : SensorLayout
-    network : Network
-    step_s : float
-        Step between instants; readings may come less often. [s]
-
-    Returns
-    -------
-    float
-        `USUAL_SOURCE` if there are fewer than 24 instants with a voltage reading. [p.u.]
-    """
-    rows = np.flatnonzero(layout.quantity == VM)
-    rows = rows[history.fresh[:, rows].any(axis=0)]
-    fresh = history.fresh[:, rows]
-    if fresh.any(axis=1).sum() < 24:
-        return USUAL_SOURCE
-    explained = _explained_voltage(history, layout, network)
-    reading = history.z[:, rows] - explained[:, layout.position[rows]]
-    reading = np.where(fresh, reading, 0.0)
-    reading = reading - reading.sum(axis=0) / np.maximum(fresh.sum(axis=0), 1)
-    count = fresh.sum(axis=1)
-    level = np.where(fresh, reading, 0.0).sum(axis=1)[count > 0] / count[count > 0]
-
-    def innovation(log_ratio: float) -> tuple[FloatArray, float]:
-        """Innovations of the steady-state filter, and their variance in units of the noise's."""
-        ratio = np.exp(log_ratio)
-        prior = 0.5 * (ratio + np.sqrt(ratio**2 + 4.0 * ratio))
-        gain = prior / (prior + 1.0)
-        forecast = signal.lfilter([gain], [1.0, gain - 1.0], level, zi=[(1 - gain) * level[0]])[0]
-        return level[1:] - forecast[:-1], float(prior + 1.0)
-
-    def cost(log_ratio: float) -> float:
-        # With the scale s² = mean(η²)/v, n log s² + n log v leaves n log mean(η²).
-        return float(np.log(np.mean(innovation(log_ratio)[0] ** 2)))
-
-    found = optimize.minimize_scalar(cost, bounds=(-12.0, 4.0), method="bounded")
-    eta, variance = innovation(float(found.x))
-    apart = np.diff(history.time[count > 0]) / np.timedelta64(1, "s")
-    steps = float(np.median(apart)) / step_s  # the walk moved so long between two readings
-    return float(np.sqrt(np.exp(found.x) * np.mean(eta**2) / variance / steps))
-
-
-def _explained_voltage(history: Record, layout: SensorLayout, network: Network) -> FloatArray:
-    """Part of |V| that the metered injections explain at every instant. (T, N) [p.u.]
-
-    All of this is history, so a mean counts at the middle of its interval and the time between two
-    samples is interpolated.
-    """
-    n = network.n_bus
-    sensitivity = Sensitivity(network)
-    flow = solve(network, own_references=True)
-    voltage = flow.vm * np.exp(1j * flow.theta)
-    by_input = np.zeros((n, 2 * n))
-    by_input[:, sensitivity.inputs] = (to_polar(voltage) @ sensitivity.at(voltage)[0])[n:]
-    explained = np.zeros((len(history.time), n))
-    second = (history.time - history.time[0]) / np.timedelta64(1, "s")
-    for row in np.flatnonzero(np.isin(layout.quantity, (P, Q)) & (layout.side == BUS)):
-        use = history.fresh[:, row]
-        if not use.any():
-            continue
-        middle = second[use] - history.age_s[use, row] - 0.5 * layout.window_s[row]
-        value = np.interp(second, middle, history.z[use, row])
-        place = layout.position[row] + (n if layout.quantity[row] == Q else 0)
-        explained += np.outer(value, by_input[:, place])
-    return explained

@@ -1,9 +1,9 @@
 """How the state may move between two instants: process noise of the random walk x⁺ = x + w.
 
-``scalar`` noise moves every voltage on its own. ``load`` noise moves the loads and the source and
-lets the grid carry that to the voltages, Q = S Σ_load Sᵀ + s sᵀ σ²_source, where S = ∂x/∂(P, Q) and
-s = ∂x/∂|V_source| at the forecast: on a feeder, where a change of load moves all voltages together,
-only the latter can be calibrated.
+``scalar`` noise moves every voltage on its own. ``load`` noise moves the loads and the held
+voltages and lets the grid carry that to the others, Q = S Σ_load Sᵀ + s Σ_held sᵀ, where S =
+∂x/∂(P, Q) and s = ∂x/∂|V_held| at the forecast: where a change of load moves all voltages
+together, as on a feeder, only the latter can be calibrated.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ class LoadStatistics:
         σ of the change of [P; Q] in one step, by slot of the day. [p.u.]
     correlation : (2N, 2N) ndarray
         Correlation of these changes.
-    source : float
-        σ of the change of the source voltage in one step. [p.u.]
+    held : (n_held,) ndarray
+        σ of the change of every held voltage in one step, see `Sensitivity.held`. [p.u.]
     slot_s : float
         Length of a slot. [s]
     """
 
     deviation: FloatArray
     correlation: FloatArray
-    source: float
+    held: FloatArray
     slot_s: float
 
     def deviation_at(self, time: np.datetime64) -> FloatArray:
@@ -216,7 +216,7 @@ def at_least(size: FloatArray) -> FloatArray:
 
 
 def load_noise(network: Network, statistics: LoadStatistics) -> ProcessNoise:
-    """Load changes carried through the grid: Q = S Σ_load Sᵀ + s sᵀ σ²_source. [p.u.²]"""
+    """Loads and held voltages moved through the grid: Q = S Σ_load Sᵀ + s Σ_held sᵀ. [p.u.²]"""
     sensitivity = Sensitivity(network)
     moves = sensitivity.renewed()
     inside = sensitivity.inputs
@@ -234,9 +234,7 @@ def load_noise(network: Network, statistics: LoadStatistics) -> ProcessNoise:
             return _turned(same, frame)
         deviation = at_least(whole[inside])
         # A symmetric product of one factor: Q is symmetric and semi-definite whatever the rounding.
-        half = np.concatenate(
-            [(by_input * deviation) @ root, by_voltage * statistics.source], axis=1
-        )
+        half = np.concatenate([(by_input * deviation) @ root, by_voltage * statistics.held], axis=1)
         made = np.asarray(half @ half.T)
         made.flags.writeable = False
         last.update(moves=at, deviation=whole, noise=made)
