@@ -143,7 +143,7 @@ def test_whole_filter_is_consistent_on_the_grid(window_s: float) -> None:
         rng = np.random.default_rng([SEED, seed])
         move = root @ rng.normal(size=(66, count)) / np.sqrt(fine)
         injection = nominal[:, None] + np.cumsum(move, axis=1)
-        level = 1 + np.cumsum(learnt.held[0] / np.sqrt(fine) * rng.normal(size=count))
+        level = 1 + np.cumsum(learnt.held / np.sqrt(fine) * rng.normal(size=count))
         vm = np.where((np.arange(33) == network.slack)[:, None], level, 1.0)
         flow = solve(network, injection[:33], injection[33:], vm, tolerance=1e-9)
         seen = model.h(flow.x)

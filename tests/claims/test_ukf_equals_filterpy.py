@@ -9,6 +9,7 @@ from qu_bench import VARIANCE, still
 
 from pse_analysis.estimation.core.run_arrays import EPOCH
 from pse_analysis.estimation.filters.unscented import Scaling
+from pse_analysis.estimation.process.dynamics import HoltParams
 
 SEED = 1
 ALPHA, BETA = 0.85, 0.05
@@ -26,7 +27,8 @@ def test_unscented_filter_equals_filterpy(
     grid: str, process: str, form: str, points: dict[str, float]
 ) -> None:
     b = still(grid)
-    made = b.filter(process=process, form=form, points=Scaling(**points))
+    printed = {"holt": HoltParams(as_printed=True)} if process == "holt" else {}
+    made = b.filter(process=process, form=form, points=Scaling(**points), **printed)
     n, m = len(b.start), len(b.layout)
     merwe = MerweScaledSigmaPoints(n, points["alpha"], points["beta"], points["kappa"])
     peer = UnscentedKalmanFilter(n, m, 1.0, made.model.h, lambda x, dt: x, merwe)

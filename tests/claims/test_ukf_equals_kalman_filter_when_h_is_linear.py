@@ -11,6 +11,7 @@ from pse_analysis.estimation.core.interface import Snapshot
 from pse_analysis.estimation.core.run_arrays import EPOCH
 from pse_analysis.estimation.filters.composition import Composition, compose, scalar
 from pse_analysis.estimation.filters.unscented import Scaling
+from pse_analysis.estimation.process.dynamics import HoltParams
 from pse_analysis.grid import library
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import BUS, VA, VM, SensorLayout
@@ -33,7 +34,7 @@ CHOICES = {
     "likelihood": ("ukf", Composition(scaling="likelihood")),
     "trace": ("ukf", Composition(robustness="trace")),
     "per_channel": ("ukf", Composition(robustness="per_channel")),
-    "holt": ("ukf", Composition(process="holt")),
+    "holt": ("ukf", Composition(process="holt", holt=HoltParams(as_printed=True))),
     "local_trend": ("ukf", Composition(process="local_trend")),
     "extended": ("ekf", Composition()),
     "iterated": ("ekf", Composition(passes=5)),

@@ -95,6 +95,7 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "alpha": (0.5,),
     "beta": (0.3,),
     "kappa": (2.0,),
+    "as_printed": (True,),
     "absurd": (1.0, 10.0, float("inf")),
     "protected": (False,),
     "smooth": (True,),

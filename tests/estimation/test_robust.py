@@ -15,6 +15,8 @@ from pse_analysis.estimation.core.cholesky import Root
 from pse_analysis.estimation.core.run import run
 from pse_analysis.estimation.core.run_arrays import EPOCH, ArrayRun, run_arrays
 from pse_analysis.estimation.filters.recursion import estimator
+from pse_analysis.estimation.process.dynamics import HoltParams
+from pse_analysis.estimation.static.start import Start
 from pse_analysis.grid.power_flow import solve
 from pse_analysis.measurement import VA, VM, MeasurementModel, Q
 from pse_analysis.vocabulary import Reason, Status
@@ -255,7 +257,8 @@ def test_filter_with_too_small_q_comes_back_after_a_real_step_of_load(robustness
 def test_unprotected_trace_does_not_come_back_after_a_real_step_of_load() -> None:
     b = stepped(still("ieee30"))
     moved = np.abs(b.truth[-1] - b.truth[0]).max()
-    made = b.filter(process="holt", q=1e-6, robustness="trace", protected=False)
+    printed = HoltParams(as_printed=True)
+    made = b.filter(process="holt", holt=printed, q=1e-6, robustness="trace", protected=False)
     done = b.run(made, b.measure(np.random.default_rng(SEED)))
     assert np.abs(done.x - b.truth).max(axis=1)[-1] > 0.5 * moved
 
@@ -343,7 +346,7 @@ def test_residuals_name_the_bad_channel() -> None:
     b = still("ieee14")
     z = b.measure(np.random.default_rng(SEED))
     z[3, 20] += 5.0
-    made = estimator("rukf", b.network, b.layout, b.filter(robustness="per_channel"))
+    made = estimator("rukf", b.filter(robustness="per_channel"), Start(b.network, b.layout))
     tables = run(made, (b.snapshot(row) for row in z), b.network, b.layout)
     named = tables.residuals[tables.residuals["inflation"] > 0]
     assert list(named["channel"]) == [b.layout.channel[20]]

@@ -63,7 +63,7 @@ def made(layout: SensorLayout, **keys: object) -> Estimator:
     study = replace(tiny_case.STUDY, step_s=tiny_case.STEP_S)
     empty = walk(layout, 2, 0, 0.0).between(None, np.datetime64("1990-01-01", "us"))
     setting = Setting(NETWORK, layout, study, empty)
-    whole = {"noise": "scalar", "variance": Q, **keys}
+    whole = {"noise": "scalar", "variance": Q, "angle_reference": "fixed", **keys}
     return Method.of("f", **whole).estimator(setting)
 
 

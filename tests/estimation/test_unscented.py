@@ -86,7 +86,7 @@ def test_rows_that_are_not_available_count_for_nothing() -> None:
 
 def test_instant_without_any_measurement_is_only_predicted() -> None:
     b = still("ieee14")
-    made = b.filter(process="holt")
+    made = b.filter(process="holt", holt=dynamics.HoltParams(as_printed=True))
     state = made.begin(b.truth[0], b.start, EPOCH)
     after, info = made.step(state, b.snapshot(b.exact[0], np.zeros(len(b.layout), dtype=bool)))
     assert info.status is Status.PREDICTED
@@ -139,11 +139,12 @@ def test_alpha_on_ieee30_settles_as_published() -> None:
     angle = np.where(size < 0.02, 0.002, 0.02)
     model = MeasurementModel(b.network, b.layout)
     variance = np.concatenate([angle, size]) ** 2
+    printed = dynamics.holt(dynamics.HoltParams(as_printed=True))
     made = recursion.GaussianFilter(
         model,
-        dynamics.holt(),
+        printed,
         unscented.by_moments(model),
-        sage_husa.known(sage_husa.constant(variance), dynamics.holt()),
+        sage_husa.known(sage_husa.constant(variance), printed),
     )
     z = b.measure(np.random.default_rng(SEED))[:30]
     alpha = run_arrays(made, b.truth[0], np.diag(variance), z, b.layout.sigma).alpha

@@ -13,6 +13,7 @@ from pse_analysis.estimation.bad_data.innovation_test import InnovationTest, Ref
 from pse_analysis.estimation.core.interface import Estimator
 from pse_analysis.estimation.core.run import ConsistencyParams
 from pse_analysis.estimation.filters import composition, intervals, restart
+from pse_analysis.estimation.filters.angle_reference import AngleReference
 from pse_analysis.estimation.filters.composition import Composition
 from pse_analysis.estimation.filters.kalman import kalman_filter
 from pse_analysis.estimation.filters.restart import RestartParams
@@ -21,9 +22,11 @@ from pse_analysis.estimation.process import covariance_matching, learn_from_hist
 from pse_analysis.estimation.process.covariance_matching import CovarianceMatching
 from pse_analysis.estimation.process.load_noise import ProcessNoise
 from pse_analysis.estimation.process.sage_husa import VoltageNoise, of_grid
+from pse_analysis.estimation.static.start_prior import start_prior
 from pse_analysis.estimation.static.tracking import WlsParams, tracking_wls
 from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.machine import Machine
+from pse_analysis.measurement import SensorLayout
 from pse_analysis.measurement.rectangular import Linearisation
 
 VARIANCE = 1e-6
@@ -105,6 +108,9 @@ class GridFilter(GridMethod):
         given. [p.u.]
     history : HistoryParams, optional
         How ``load`` noise is learnt.
+    angle_reference : {"moving", "fixed"}
+        Whether measured angles may count from something that moves against the grid, as a clock
+        does (`pse_analysis.estimation.filters.angle_reference`).
     compose : Composition
         What the filter is made of; each kind has some of the parts.
     restart : RestartParams
@@ -127,6 +133,7 @@ class GridFilter(GridMethod):
     variance: float | None = None
     source_sigma: float | None = None
     history: HistoryParams | None = None
+    angle_reference: Literal["moving", "fixed"] = "moving"
     compose: Composition = field(default_factory=Composition)
     restart: RestartParams = field(default_factory=RestartParams)
     consistency: ConsistencyParams = field(default_factory=ConsistencyParams)
@@ -183,6 +190,11 @@ class GridFilter(GridMethod):
 
     def unscreened(self, setting: Setting) -> Estimator:
         return restart.guarded(self.unguarded(setting), setting.layout, self.restart)
+
+    def reference(self, layout: SensorLayout) -> AngleReference | None:
+        """How the reference of measured angles moves; None where it stands still, or none is."""
+        moving = self.angle_reference == "moving" and layout.has_angle
+        return AngleReference(layout) if moving else None
 
     def unguarded(self, setting: Setting) -> Estimator:
         """The filter without its restarts."""
@@ -268,6 +280,8 @@ class KalmanFilter(GridFilter):
             refuse=self.refuse(),
             process=composition.process_of(self.compose),
             linearisation=self.linearisation,
+            reference=self.reference(layout),
+            prior=start_prior(network, layout, history),
         )
 
 
@@ -293,7 +307,15 @@ class PolarFilter(GridFilter):
             noise = of_grid(network, self.known_noise(setting), state_columns(network, layout))
         observation: Literal["ukf", "ekf"] = "ukf" if "points" in self.parts else "ekf"
         return composition.build(
-            self.name, observation, self.compose, network, layout, noise, self.refuse()
+            self.name,
+            observation,
+            self.compose,
+            network,
+            layout,
+            noise,
+            self.refuse(),
+            self.reference(layout),
+            start_prior(network, layout, setting.history),
         )
 
 

@@ -192,8 +192,8 @@ class Dynamics(NamedTuple):
 class Estimator(NamedTuple):
     """A method: three functions over an opaque state.
 
-    ``widened``, where it is given, makes a state far more uncertain; ``dynamics`` lets a smoother
-    look back from later instants.
+    Where they are given, ``widened`` makes a state far more uncertain, ``dynamics`` lets a smoother
+    look back from later instants, and ``again`` starts from a snapshot and nothing else.
     """
 
     name: str
@@ -202,3 +202,4 @@ class Estimator(NamedTuple):
     read: Callable[[Any], Estimate | None]
     widened: Callable[[Any], Any] | None = None
     dynamics: Dynamics | None = None
+    again: Callable[[Snapshot], tuple[Any, Info]] | None = None

@@ -17,8 +17,8 @@ from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray
 from pse_analysis.estimation.process.dynamics import Process
 from pse_analysis.measurement.rectangular import Linear, Memo, Pattern
 
-SLIGHT_TURN = 1e-3
-"""Largest factor, apart from 1, on voltages that leaves their covariance as it is."""
+MOST_SIGMAS = 3.0
+"""How far a voltage may be moved, in its σ, by turning it instead of adding a correction."""
 
 
 class Belief(NamedTuple):
@@ -246,33 +246,39 @@ class AugmentedState:
         out[:, :kept] = (known[:, 0] + 1j * known[:, 1]).T
         return out
 
-    def turned(self, before: Belief, after: FloatArray, P: FloatArray) -> Belief:
+    def turned(self, before: FloatArray, after: FloatArray, P: FloatArray) -> FloatArray:
         """A corrected state in which what goes across a voltage has turned it.
 
-        Added to a voltage, a correction by an angle δ would lengthen it by δ²/2. Its covariance
-        turns with it. What a process adds to the present is left as it is.
+        Added to a voltage, a correction by an angle δ would lengthen it by δ²/2. A voltage that is
+        told more exactly than that (`MOST_SIGMAS`) stays as its rows, expanded about it, have it.
+        What a process adds to the present is left as it is.
+
+        Parameters
+        ----------
+        before, after : (B·n,) ndarray
+            A state and what it was corrected to.
+        P : (B·n, B·n) ndarray
+            Its covariance.
+
+        Returns
+        -------
+        (B·n,) ndarray
         """
         n, kept = self.n // 2, self.past * self.n
-        old, new = (s[:kept].reshape(-1, 2, n) for s in (before.x, after))
-        voltage = old[:, 0] + 1j * old[:, 1]
-        change = (new[:, 0] + 1j * new[:, 1]) / voltage - 1.0
-        turn = (1.0 + change.real) * np.exp(1j * change.imag)
-        voltage = turn * voltage
-        x = after.copy()
-        x[:kept] = np.stack([voltage.real, voltage.imag], axis=1).ravel()
-        if np.abs(turn - 1.0).max(initial=0.0) > SLIGHT_TURN:
-            P = self._along(self._along(P, turn).T, turn)
-            P = 0.5 * (P + P.T)
-        return Belief(x, P, before.memory)
-
-    def _along(self, P: FloatArray, turn: ComplexArray) -> FloatArray:
-        """Rows of [e; f] of the present and the past multiplied by complex factors (L, N)."""
-        out = P.copy()
-        rows = P[: self.past * self.n].reshape(self.past, 2, self.n // 2, -1)
-        here = out[: self.past * self.n].reshape(rows.shape)
-        real, imaginary = turn.real[..., None], turn.imag[..., None]
-        here[:, 0] = real * rows[:, 0] - imaginary * rows[:, 1]
-        here[:, 1] = imaginary * rows[:, 0] + real * rows[:, 1]
+        old, new = (s[:kept].reshape(-1, 2, n) for s in (before, after))
+        voltage, added = (s[:, 0] + 1j * s[:, 1] for s in (old, new))
+        change = added / voltage - 1.0
+        turned = voltage * (1.0 + change.real) * np.exp(1j * change.imag)
+        direction = added / np.abs(added)
+        apart = (turned - added) / direction
+        e = (self.n * np.arange(self.past)[:, None] + np.arange(n)).ravel()
+        e_e, e_f, f_f = (P[i, j].reshape(-1, n) for i, j in ((e, e), (e, e + n), (e + n, e + n)))
+        both, c, s = 2.0 * direction.real * direction.imag * e_f, direction.real, direction.imag
+        along, across = c**2 * e_e + both + s**2 * f_f, s**2 * e_e - both + c**2 * f_f
+        exact = (apart.real**2 > MOST_SIGMAS**2 * along) | (apart.imag**2 > MOST_SIGMAS**2 * across)
+        voltage = np.where(exact, added, turned)
+        out = after.copy()
+        out[:kept] = np.stack([voltage.real, voltage.imag], axis=1).ravel()
         return out
 
     def expect(

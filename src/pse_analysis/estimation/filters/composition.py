@@ -14,11 +14,14 @@ from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.bad_data.robust import Protection
 from pse_analysis.estimation.core.interface import Estimator
 from pse_analysis.estimation.filters import linearised, recursion, unscented
+from pse_analysis.estimation.filters.angle_reference import AngleReference
 from pse_analysis.estimation.filters.restart import ABSURD
 from pse_analysis.estimation.filters.unscented import Form, Scaling
 from pse_analysis.estimation.process import dynamics, sage_husa
 from pse_analysis.estimation.process.dynamics import HoltParams
 from pse_analysis.estimation.process.sage_husa import VoltageNoise
+from pse_analysis.estimation.static.start import Start
+from pse_analysis.estimation.static.start_prior import StartPrior
 from pse_analysis.estimation.static.wls import state_columns
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import MeasurementModel, SensorLayout
@@ -92,6 +95,8 @@ class Composition:
         judged = self.robustness != "none"
         if self.process == "random_walk" and self.holt != HoltParams():
             yield "holt", 'take process = "holt" or "local_trend"'
+        if self.process == "local_trend" and self.holt.as_printed:
+            yield "holt.as_printed", 'take process = "holt"'
         if self.learning == "none" and self.forgetting != FORGETTING:
             yield "forgetting", 'take learning = "sage_husa"'
         if not judged and not self.protected:
@@ -118,6 +123,7 @@ def compose(
     layout: SensorLayout,
     voltages: VoltageNoise,
     refuse: Refuse | None = None,
+    reference: AngleReference | None = None,
 ) -> recursion.GaussianFilter:
     """The filter of a composition.
 
@@ -131,6 +137,8 @@ def compose(
         Process noise of the estimated voltages, from which learning starts.
     refuse : Refuse, optional
         Innovation test that stands in the place of a robustness.
+    reference : AngleReference, optional
+        How the reference of measured angles moves; it stands still if not given.
 
     Returns
     -------
@@ -164,6 +172,7 @@ def compose(
         observation,
         made,
         recursion.Robustness(judge, composition.protection if judges else None, composition.absurd),
+        reference,
     )
 
 
@@ -175,10 +184,12 @@ def build(
     layout: SensorLayout,
     voltages: VoltageNoise,
     refuse: Refuse | None = None,
+    reference: AngleReference | None = None,
+    prior: StartPrior | None = None,
 ) -> Estimator:
-    """Estimator of a composition, started from weighted least squares."""
-    made = compose(kind, composition, network, layout, voltages, refuse)
-    return recursion.estimator(name, network, layout, made)
+    """Estimator of a composition, started from a snapshot and what was usual before it."""
+    made = compose(kind, composition, network, layout, voltages, refuse, reference)
+    return recursion.estimator(name, made, Start(network, layout, prior))
 
 
 def scalar(network: Network, layout: SensorLayout, variance: float) -> VoltageNoise:

@@ -10,12 +10,12 @@ belongs.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray
+from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from pse_analysis.estimation.bad_data.innovation_test import Refuse
 from pse_analysis.estimation.core.cholesky import cleaned
 from pse_analysis.estimation.core.interface import (
@@ -26,19 +26,20 @@ from pse_analysis.estimation.core.interface import (
     Transition,
     Voltages,
 )
-from pse_analysis.estimation.filters import intervals
-from pse_analysis.estimation.filters.augmented_state import AugmentedState, Belief, Reach, Rows
+from pse_analysis.estimation.filters.angle_reference import AngleReference, Frame, absolute
+from pse_analysis.estimation.filters.augmented_state import AugmentedState, Belief
 from pse_analysis.estimation.filters.conditioning import Prior, Solved
 from pse_analysis.estimation.filters.restart import WIDER, gross_errors
-from pse_analysis.estimation.filters.row_moments import Expansion, RowMoments
+from pse_analysis.estimation.filters.row_moments import Expansion, Interval, Reader, RowMoments
 from pse_analysis.estimation.process import covariance_matching, dynamics
 from pse_analysis.estimation.process.covariance_matching import CovarianceMatching, Matched
 from pse_analysis.estimation.process.load_noise import ProcessNoise, to_polar, to_rectangular
-from pse_analysis.estimation.static.robust_wls import begin
-from pse_analysis.estimation.static.wls import WeightedLeastSquares
+from pse_analysis.estimation.static.start import Start
+from pse_analysis.estimation.static.start_prior import StartPrior
+from pse_analysis.estimation.static.wls import WlsSolution
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import RectangularModel, SensorLayout
-from pse_analysis.measurement.rectangular import Linearisation, Memo
+from pse_analysis.measurement.rectangular import Linearisation
 from pse_analysis.vocabulary import Reason, Status
 
 MAX_PASSES = 8
@@ -59,12 +60,25 @@ class KalmanState:
         Memory of the process.
     noise : Matched, optional
         Memory of a noise that is estimated.
+    frame : Frame, optional
+        What its angles count from, where the reference of measured angles moves.
     """
 
     x: FloatArray
     P: FloatArray
     process: Any = None
     noise: Matched | None = None
+    frame: Frame | None = None
+
+
+class _Moved(NamedTuple):
+    """What a state has moved to: Q of the step and its shapes, and the snapshot in its frame."""
+
+    prior: Belief
+    noise: FloatArray
+    shapes: tuple[FloatArray, ...]
+    frame: Frame | None
+    snapshot: Snapshot
 
 
 class KalmanFilter:
@@ -83,20 +97,22 @@ class KalmanFilter:
         refuse: Refuse | None,
         process: dynamics.Process,
         linearisation: Linearisation,
+        reference: AngleReference | None,
     ) -> None:
         self.n_bus, self.layout = network.n_bus, layout
-        self.step_s, self.instant, self.refuse = step_s, instant, refuse
-        self.linearisation = linearisation
-        self.model = RectangularModel(network, layout)
+        self.refuse = refuse
+        self.linearisation, self.reference = linearisation, reference
         # A smoother looks back from a state that knows all instants that were read.
-        self._readable = lags
         self.lagged = AugmentedState(2 * network.n_bus, lags + 1 if smooth else lags, process)
+        self._reader = Reader(
+            RectangularModel(network, layout),
+            self.lagged,
+            linearisation,
+            None if instant else Interval(layout.window_s, step_s, lags),
+        )
         self._noise = noise
         # Without an outside angle reference the slack's f stays 0: no noise, no prior, no gain.
         self._held = None if layout.has_angle else network.n_bus + network.slack
-        # The same channels report again and again, often at the same age.
-        self._rows: Memo[Rows] = Memo()
-        self._reaches: Memo[Reach] = Memo()
 
     def process_noise(
         self, memory: Matched | None, x: FloatArray, time: np.datetime64
@@ -123,36 +139,41 @@ class KalmanFilter:
         return np.asarray(x[:n] + 1j * x[n : 2 * n])
 
     def begin(
-        self, voltage: ComplexArray, covariance: FloatArray, time: np.datetime64
+        self,
+        voltage: ComplexArray,
+        covariance: FloatArray,
+        time: np.datetime64,
+        *,
+        measured: bool = True,
     ) -> KalmanState:
         """State from a voltage and the covariance (2N, 2N) of its [e; f]."""
         x = np.concatenate([voltage.real, voltage.imag])
         noise = self._noise.begin() if isinstance(self._noise, CovarianceMatching) else None
-        return KalmanState(
-            *self.lagged.begin(x, covariance, self.process_noise(noise, x, time)[0]), noise
-        )
+        begun = self.lagged.begin(x, covariance, self.process_noise(noise, x, time)[0])
+        frame = None if self.reference is None else self.reference.begin(measured=measured)
+        return KalmanState(*begun, noise, frame)
 
     def step(self, state: KalmanState, snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
         """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
         m = len(self.layout)
         belief = Belief(state.x, state.P, state.process)
-        prior, noise, shapes = self._moved(belief, state.noise, snapshot.time)
-        used, sigma = self._usable(snapshot)
+        prior, noise, shapes, frame, snapshot = self._moved(belief, state, snapshot)
+        used, sigma = self._reader.usable(snapshot)
         told, refused = np.full((2, m), np.nan), np.zeros(m, dtype=bool)
         given = belief, prior, noise, snapshot, sigma
         try:
             if used.any():
-                reading = self._reading(*given, used)
+                reading = self._reader.moments(*given, used)
                 first = self._expanded(reading)
                 refused[used] = self._refuses(*first)
             if refused.any():
                 told[:, refused] = first[0].eta[refused[used]], first[1].sigma[refused[used]]
                 used = used & ~refused
                 if used.any():
-                    reading = self._reading(*given, used)
+                    reading = self._reader.moments(*given, used)
                     first = self._expanded(reading)
             if not used.any():
-                return KalmanState(*prior, state.noise), replace(
+                return KalmanState(*prior, state.noise, frame), replace(
                     Info.nothing(m, Status.PREDICTED),
                     innovation=told[0],
                     sigma_innovation=told[1],
@@ -173,10 +194,10 @@ class KalmanFilter:
             moving = 1.0 if found.reach is None else found.reach.moving
             response = covariance_matching.responses(shapes, found.plane, moving, solved.chol_S)
             learnt = self._noise.learn(learnt, response, solved.white)
-        corrected = Belief(after.s, after.P, prior.memory)
+        x = after.s
         if self.linearisation == "derivative":
-            corrected = self.lagged.turned(prior, after.s, after.P)
-        return KalmanState(*corrected, learnt), Info(
+            x = self.lagged.turned(prior.x, x, after.P)
+        return KalmanState(x, after.P, prior.memory, learnt, frame), Info(
             Status.OK,
             passes,
             after.nis,
@@ -188,27 +209,53 @@ class KalmanFilter:
             reasons=_refusals(refused),
         )
 
-    def _moved(
-        self, belief: Belief, memory: Matched | None, time: np.datetime64
-    ) -> tuple[Belief, FloatArray, tuple[FloatArray, ...]]:
-        """The state at an instant before its measurements, Q of the step, and its shapes."""
+    def _moved(self, belief: Belief, state: KalmanState, snapshot: Snapshot) -> _Moved:
+        """The state at the instant of a snapshot before its measurements."""
         forecast = self.lagged.forecast(belief)
-        walk, shapes = self.process_noise(memory, forecast[0], time)
+        walk, shapes = self.process_noise(state.noise, forecast[0], snapshot.time)
+        frame = state.frame
+        if self.reference is not None and frame is not None:
+            snapshot, frame, walk = self._followed(self.reference, frame, snapshot, forecast, walk)
         noise = self.lagged.process.noise(walk)
-        return self.lagged.moved(belief, forecast, noise), noise, shapes
+        return _Moved(self.lagged.moved(belief, forecast, noise), noise, shapes, frame, snapshot)
+
+    def _followed(
+        self,
+        reference: AngleReference,
+        frame: Frame,
+        snapshot: Snapshot,
+        forecast: tuple[FloatArray, FloatArray, Any],
+        walk: FloatArray,
+    ) -> tuple[Snapshot, Frame, FloatArray]:
+        """The snapshot in the filter's frame, that frame, and Q with what it may have moved."""
+        n, x, P = self.n_bus, *forecast[:2]
+        voltage = self.voltage(x)
+
+        def covariance(bus: IntArray) -> FloatArray:
+            both, k = np.concatenate([bus, n + bus]), len(bus)
+            half = P[np.ix_(both, both)] + walk[np.ix_(both, both)]
+            across = 1j * voltage[bus] / np.abs(voltage[bus]) ** 2
+            left = across.real[:, None] * half[:k] + across.imag[:, None] * half[k:]
+            return np.asarray(left[:, :k] * across.real + left[:, k:] * across.imag)
+
+        found = reference.follow(frame, snapshot, np.angle(voltage), covariance)
+        turn = np.concatenate([-x[n : 2 * n], x[:n]])
+        walk = walk + np.outer(found.variance * turn, turn)
+        return found.snapshot, found.frame, walk
 
     def predict(self, state: KalmanState, snapshot: Snapshot) -> Transition:
         """How the state moves to the instant of a snapshot, before that is read."""
         belief = Belief(state.x, state.P, state.process)
-        prior, _, _ = self._moved(belief, state.noise, snapshot.time)
+        prior = self._moved(belief, state, snapshot).prior
         return Transition(prior.x, prior.P, self.lagged.cross(belief))
 
-    def estimate(self, x: FloatArray, P: FloatArray) -> Voltages:
-        """Present voltages in polar form."""
+    def estimate(self, state: KalmanState, x: FloatArray, P: FloatArray) -> Voltages:
+        """Present voltages in polar form, of a mean and covariance in the frame of a state."""
         n, voltage = self.n_bus, self.voltage(x)
         turn = to_polar(voltage)
         covariance = turn @ P[: 2 * n, : 2 * n] @ turn.T
-        return Voltages(np.concatenate([np.angle(voltage), np.abs(voltage)]), covariance)
+        polar = np.concatenate([np.angle(voltage), np.abs(voltage)])
+        return absolute(polar, covariance, state.frame)
 
     def _expanded(
         self, reading: RowMoments, instants: ComplexArray | None = None
@@ -235,38 +282,6 @@ class KalmanFilter:
             found, solved = self._expanded(reading, instants)
         return found, solved, passes
 
-    def _usable(self, snapshot: Snapshot) -> tuple[BoolArray, FloatArray]:
-        """Rows that are used, and their σ."""
-        if self.instant:
-            return snapshot.available, snapshot.sigma
-        near = intervals.covered(snapshot.age_s, self.layout.window_s, self.step_s, self._readable)
-        return snapshot.available & snapshot.fresh & near, snapshot.sigma_own
-
-    def _reading(
-        self,
-        belief: Belief,
-        prior: Belief,
-        noise: FloatArray,
-        snapshot: Snapshot,
-        sigma: FloatArray,
-        used: BoolArray,
-    ) -> RowMoments:
-        """What the used rows of a snapshot read."""
-        at, key = np.flatnonzero(used), used.tobytes()
-        frame = self.model.frame(snapshot.z, sigma, used, at)
-        rows = self._rows.get(key, lambda: Rows(frame.pattern))
-        reach: Reach | None = None
-        if not self.instant:
-            ages, windows = snapshot.age_s[at], self.layout.window_s[at]
-            reach = self._reaches.get(key + ages.tobytes(), lambda: self._reach(ages, windows))
-        return RowMoments(self.lagged, belief, prior, noise, rows, frame, reach, self.linearisation)
-
-    def _reach(self, age_s: FloatArray, window_s: FloatArray) -> Reach:
-        ages, windows, kind = intervals.kinds(age_s, window_s)
-        between = ages, windows, self.step_s, self.lagged.lags
-        bridge = intervals.bridge_covariance(*between)
-        return Reach(intervals.weights(*between)[kind], bridge[kind[:, None], kind])
-
 
 def kalman_filter(
     name: str,
@@ -281,6 +296,8 @@ def kalman_filter(
     refuse: Refuse | None = None,
     process: dynamics.Process | None = None,
     linearisation: Linearisation = "derivative",
+    reference: AngleReference | None = None,
+    prior: StartPrior | None = None,
 ) -> Estimator:
     """Kalman filter in rectangular coordinates.
 
@@ -311,12 +328,15 @@ def kalman_filter(
     linearisation : {"derivative", "transform"}
         Whether the rows of powers have the whole derivative, or are the currents of [qi2025], which
         claim to know the angle that all buses share; see `RectangularModel`.
+    reference : AngleReference, optional
+        How the reference of measured angles moves; it stands still if not given.
+    prior : StartPrior, optional
+        What was usual before the first snapshot.
 
     Returns
     -------
     Estimator
-        It starts from a weighted least-squares estimate and uses every sample once, unless
-        ``instant``.
+        It uses every sample once, unless ``instant``.
 
     Notes
     -----
@@ -336,28 +356,37 @@ def kalman_filter(
         refuse=refuse,
         process=process or dynamics.random_walk(),
         linearisation=linearisation,
+        reference=reference,
     )
-    wls = WeightedLeastSquares(network, layout)
-    n = network.n_bus
+    start, n = Start(network, layout, prior), network.n_bus
 
-    def init(snapshot: Snapshot) -> tuple[KalmanState | None, Info]:
-        solution, info = begin(wls, snapshot)
+    def begun(
+        found: tuple[WlsSolution | None, Info], time: np.datetime64
+    ) -> tuple[KalmanState | None, Info]:
+        solution, info = found
         if solution is None:
             return None, info
         voltage = solution.x[n:] * np.exp(1j * solution.x[:n])
         turn = to_rectangular(voltage)
-        return made.begin(voltage, turn @ solution.covariance() @ turn.T, snapshot.time), info
+        covariance = turn @ solution.covariance() @ turn.T
+        return made.begin(voltage, covariance, time, measured=not solution.pinned), info
 
     def read(state: KalmanState) -> Voltages:
-        return made.estimate(state.x, state.P)
+        return made.estimate(state, state.x, state.P)
 
     def widened(state: KalmanState) -> KalmanState:
         return replace(state, P=WIDER**2 * state.P)
 
-    moves = Dynamics(
-        lambda state: (state.x, state.P), made.predict, lambda _state, x, P: made.estimate(x, P)
+    moves = Dynamics(lambda state: (state.x, state.P), made.predict, made.estimate)
+    return Estimator(
+        name,
+        lambda snapshot: begun(start.first(snapshot), snapshot.time),
+        made.step,
+        read,
+        widened,
+        moves,
+        lambda snapshot: begun(start.alone(snapshot), snapshot.time),
     )
-    return Estimator(name, init, made.step, read, widened, moves)
 
 
 def _refusals(refused: BoolArray) -> npt.NDArray[np.int32]:

@@ -22,6 +22,7 @@ from pse_analysis.estimation.core.interface import (
     Transition,
     Voltages,
 )
+from pse_analysis.estimation.filters.angle_reference import AngleReference, Frame, absolute
 from pse_analysis.estimation.filters.conditioning import Prior
 from pse_analysis.estimation.filters.protection import Recovery
 from pse_analysis.estimation.filters.restart import ABSURD, WIDER
@@ -29,10 +30,9 @@ from pse_analysis.estimation.filters.square_root import carried
 from pse_analysis.estimation.filters.update import Observation, Update, update
 from pse_analysis.estimation.process.dynamics import Process
 from pse_analysis.estimation.process.sage_husa import Learnt, Noise
-from pse_analysis.estimation.static.robust_wls import begin
-from pse_analysis.estimation.static.wls import WeightedLeastSquares
-from pse_analysis.grid.network import Network
-from pse_analysis.measurement import VA, VM, MeasurementModel, SensorLayout, wrap
+from pse_analysis.estimation.static.start import Start
+from pse_analysis.estimation.static.wls import WlsSolution
+from pse_analysis.measurement import VA, VM, MeasurementModel, wrap
 from pse_analysis.vocabulary import Status
 
 
@@ -76,6 +76,8 @@ class GaussianState:
         Consecutive snapshots that were refused as a whole.
     chol_P : (N, N) ndarray, optional
         Root of P, where it is carried beside it.
+    frame : Frame, optional
+        What its angles count from, where the reference of measured angles moves.
     """
 
     s: FloatArray
@@ -87,15 +89,18 @@ class GaussianState:
     refusals: IntArray
     snapshot_rejections: int = 0
     chol_P: FloatArray | None = None
+    frame: Frame | None = None
 
 
 class _Moved(NamedTuple):
-    """F s + g, F P Fᵀ, and what process and noise remember."""
+    """F s + g, F P Fᵀ, what the parts of a filter remember, and the snapshot in the frame."""
 
     affine: FloatArray
     covariance: FloatArray
     process: Any
     noise: Any
+    frame: Frame | None
+    snapshot: Snapshot
 
 
 class GaussianFilter:
@@ -109,6 +114,8 @@ class GaussianFilter:
     observation : Observation
     noise : Noise
     robustness : Robustness
+    reference : AngleReference, optional
+        How the reference of measured angles moves; it stands still if not given.
     """
 
     def __init__(
@@ -118,20 +125,27 @@ class GaussianFilter:
         observation: Observation,
         noise: Noise,
         robustness: Robustness | None = None,
+        reference: AngleReference | None = None,
     ) -> None:
         self.model = model
         self.process = process
         self.observation = observation
         self.noise = noise
         self.robustness = robustness or Robustness()
+        self.reference = reference
         # Voltages come first: what is linear in the state needs no inverse to be judged.
         voltage = np.isin(model.layout.quantity, (VM, VA))
         self._order = np.concatenate([np.flatnonzero(voltage), np.flatnonzero(~voltage)])
         protection = self.robustness.protection
         self._recovery = None if protection is None else Recovery(model, protection)
 
-    def begin(self, x: FloatArray, P: FloatArray, time: np.datetime64) -> GaussianState:
-        """State from an estimate of [θ; |V|] (2N,) with covariance P (n, n) of the columns."""
+    def begin(
+        self, x: FloatArray, P: FloatArray, time: np.datetime64, *, measured: bool = True
+    ) -> GaussianState:
+        """State from an estimate of [θ; |V|] (2N,) with covariance P (n, n) of the columns.
+
+        Whether its angles were ``measured`` tells what the reference of them is known to be.
+        """
         s, covariance, memory = self.process.begin(
             x[self.model.columns], P, self.noise.voltages(x, time)
         )
@@ -143,17 +157,20 @@ class GaussianFilter:
             self.noise.begin(x, time),
             self.observation.alpha,
             np.zeros(self.model.shape[0], dtype=np.int64),
+            frame=None if self.reference is None else self.reference.begin(measured=measured),
         )
 
     def step(self, state: GaussianState, snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
         """Carry the state to a snapshot; None, and status ``diverged``, if S is lost."""
         m = self.model.shape[0]
-        prior, moved = self._moved(state, snapshot.time)
+        prior, moved = self._moved(state, snapshot)
+        snapshot = moved.snapshot
         used = snapshot.available & snapshot.fresh
         if not used.any():
             ahead = replace(
                 state, s=prior.s, P=prior.P, x=prior.x, process=moved.process, chol_P=prior.carried
             )
+            ahead = replace(ahead, frame=moved.frame)
             return ahead, Info.nothing(m, Status.PREDICTED)
         rows = self._order[used[self._order]]
         judge, status, detail = self.robustness.judge, Status.OK, ""
@@ -185,6 +202,7 @@ class GaussianFilter:
                         noise=state.noise,
                         alpha=done.alpha,
                         snapshot_rejections=snapshot_rejections,
+                        frame=moved.frame,
                     )
                     return again, restart.report.info(Status.RESTARTED, snapshot, rows, detail)
                 # Wrong meters stay wrong whatever the forecast says; ask again after a while.
@@ -208,28 +226,56 @@ class GaussianFilter:
             refusals,
             snapshot_rejections,
             found.chol_P,
+            moved.frame,
         )
         return after, done.report.info(status, snapshot, rows, detail)
 
-    def _moved(self, state: GaussianState, time: np.datetime64) -> tuple[Prior, _Moved]:
-        """The state at an instant before its measurements."""
+    def _moved(self, state: GaussianState, snapshot: Snapshot) -> tuple[Prior, _Moved]:
+        """The state at the instant of a snapshot before its measurements."""
         s, forecast, process = self.process.forecast(state.s, state.P, state.process)
         columns = self.model.columns
         ahead = state.x.copy()
         ahead[columns] = s[: len(columns)]
-        drift, covariance, noise = self.noise.current(state.noise, ahead, time)
+        drift, covariance, noise = self.noise.current(state.noise, ahead, snapshot.time)
+        affine, s = s, s + drift
+        x = state.x.copy()
+        x[columns] = s[: len(columns)]
+        frame = state.frame
+        if self.reference is not None and frame is not None:
+            snapshot, frame, covariance = self._followed(
+                self.reference, frame, snapshot, x, forecast, covariance
+            )
         root = state.chol_P
         if root is not None:
             root = carried(_through(self.process.transition, root), covariance)
-        moved = _Moved(s, forecast, process, noise)
-        s = s + drift
-        x = state.x.copy()
-        x[columns] = s[: len(columns)]
+        moved = _Moved(affine, forecast, process, noise, frame, snapshot)
         return Prior(s, forecast + covariance, x, columns, root), moved
+
+    def _followed(
+        self,
+        reference: AngleReference,
+        frame: Frame,
+        snapshot: Snapshot,
+        x: FloatArray,
+        forecast: FloatArray,
+        noise: FloatArray,
+    ) -> tuple[Snapshot, Frame, FloatArray]:
+        """The snapshot in the filter's frame, that frame, and Q with what it may have moved."""
+        n = self.model.network.n_bus
+
+        def covariance(bus: IntArray) -> FloatArray:
+            # Where angles are measured all of them are estimated, and they come first.
+            inside = np.ix_(bus, bus)
+            return np.asarray(forecast[inside] + noise[inside])
+
+        found = reference.follow(frame, snapshot, x[:n], covariance)
+        noise = noise.copy()
+        noise[:n, :n] += found.variance
+        return found.snapshot, found.frame, noise
 
     def predict(self, state: GaussianState, snapshot: Snapshot) -> Transition:
         """How the state moves to the instant of a snapshot, before that is read."""
-        prior, _ = self._moved(state, snapshot.time)
+        prior, _ = self._moved(state, snapshot)
         return Transition(prior.s, prior.P, _through(self.process.transition, state.P).T)
 
     def difference(self, one: FloatArray, other: FloatArray) -> FloatArray:
@@ -246,7 +292,7 @@ class GaussianFilter:
         x[columns] = s[: len(columns)]
         covariance = np.zeros((len(x), len(x)))
         covariance[np.ix_(columns, columns)] = P[: len(columns), : len(columns)]
-        return Voltages(x, covariance)
+        return absolute(x, covariance, state.frame)
 
     def _refused(
         self, state: GaussianState, done: Update, rows: IntArray, judge: GrossErrorTest
@@ -276,31 +322,31 @@ def _through(transition: FloatArray, root: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ij,jnk->ink", transition, blocks).reshape(root.shape))
 
 
-def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianFilter) -> Estimator:
-    """Estimator that starts a filter from weighted least squares.
+def estimator(name: str, made: GaussianFilter, start: Start) -> Estimator:
+    """Estimator that starts a filter and steps it on.
 
     Parameters
     ----------
     name : str
         Of the method.
-    network : Network
-    layout : SensorLayout
     made : GaussianFilter
+    start : Start
 
     Returns
     -------
     Estimator
         It uses every sample once, with the σ that its age gave it.
     """
-    wls = WeightedLeastSquares(network, layout)
-    columns = made.model.columns
-    inside = np.ix_(columns, columns)
+    inside = np.ix_(made.model.columns, made.model.columns)
 
-    def init(snapshot: Snapshot) -> tuple[GaussianState | None, Info]:
-        solution, info = begin(wls, snapshot)
+    def begun(
+        found: tuple[WlsSolution | None, Info], time: np.datetime64
+    ) -> tuple[GaussianState | None, Info]:
+        solution, info = found
         if solution is None:
             return None, info
-        return made.begin(solution.x, solution.covariance()[inside], snapshot.time), info
+        P = solution.covariance()[inside]
+        return made.begin(solution.x, P, time, measured=not solution.pinned), info
 
     def read(state: GaussianState) -> Voltages:
         return made.estimate(state, state.s, state.P)
@@ -312,4 +358,12 @@ def estimator(name: str, network: Network, layout: SensorLayout, made: GaussianF
     dynamics = Dynamics(
         lambda state: (state.s, state.P), made.predict, made.estimate, made.difference
     )
-    return Estimator(name, init, made.step, read, widened, dynamics)
+    return Estimator(
+        name,
+        lambda snapshot: begun(start.first(snapshot), snapshot.time),
+        made.step,
+        read,
+        widened,
+        dynamics,
+        lambda snapshot: begun(start.alone(snapshot), snapshot.time),
+    )

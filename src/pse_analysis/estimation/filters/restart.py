@@ -131,7 +131,10 @@ class Guard:
 
     def init(self, snapshot: Snapshot) -> tuple[Guarded | None, Info]:
         """Start from a snapshot; None if what it says is impossible."""
-        state, info = self._tried(self.inner.init, snapshot)
+        return self._started(self.inner.init, snapshot)
+
+    def _started(self, start: Any, snapshot: Snapshot) -> tuple[Guarded | None, Info]:
+        state, info = self._tried(start, snapshot)
         why = "" if state is None else self.impossible(state, snapshot)
         if why:
             return None, Info.nothing(len(self.layout), Status.NOT_CONVERGED, why)
@@ -146,7 +149,7 @@ class Guard:
             why = why or f"{strange} snapshots in a row contradicted the forecast"
         if after is not None and not why:
             return Guarded(after, 0, strange), info
-        begun, told = self.init(snapshot)
+        begun, told = self._started(self.inner.again or self.inner.init, snapshot)
         if begun is not None:
             detail = f"{why}: the filter starts again from this snapshot alone"
             if told.detail:

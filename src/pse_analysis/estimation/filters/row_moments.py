@@ -12,11 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from pse_analysis.arrays import ComplexArray, FloatArray
+from pse_analysis.arrays import BoolArray, ComplexArray, FloatArray
+from pse_analysis.estimation.core.interface import Snapshot
+from pse_analysis.estimation.filters import intervals
 from pse_analysis.estimation.filters.augmented_state import AugmentedState, Belief, Reach, Rows
 from pse_analysis.estimation.filters.conditioning import Moments
 from pse_analysis.estimation.filters.linearised import linear_halves
-from pse_analysis.measurement.rectangular import Frame, Linear, Linearisation
+from pse_analysis.measurement import RectangularModel
+from pse_analysis.measurement.rectangular import Frame, Linear, Linearisation, Memo
 
 REFINE_PU = 1e-3
 """Transformed rows are renewed if an update moves a voltage by more than this. [p.u.]"""
@@ -159,3 +162,82 @@ class RowMoments:
                 current[lone] ** 2, size, out=np.zeros(len(lone)), where=size > 0
             )
         return bool((remainder <= REMAINDER * expansion.linear.spread).all())
+
+
+class Interval(NamedTuple):
+    """How samples cover the past.
+
+    Attributes
+    ----------
+    window_s : (m,) ndarray
+        Length of the interval that a sample of each row averages. [s]
+    step_s : float
+        Between instants. [s]
+    lags : int
+        Steps back up to which samples are read.
+    """
+
+    window_s: FloatArray
+    step_s: float
+    lags: int
+
+
+class Reader:
+    """Chooses the rows of snapshots that a filter reads, and how they reach into the past.
+
+    Parameters
+    ----------
+    model : RectangularModel
+    lagged : AugmentedState
+    linearisation : {"derivative", "transform"}
+    interval : Interval, optional
+        Every value counts as one of the present instant, as often as it stands there, without it.
+    """
+
+    def __init__(
+        self,
+        model: RectangularModel,
+        lagged: AugmentedState,
+        linearisation: Linearisation,
+        interval: Interval | None,
+    ) -> None:
+        self._model, self._lagged, self._linearisation = model, lagged, linearisation
+        self._interval = interval
+        # The same channels report again and again, often at the same age.
+        self._rows: Memo[Rows] = Memo()
+        self._reaches: Memo[Reach] = Memo()
+
+    def usable(self, snapshot: Snapshot) -> tuple[BoolArray, FloatArray]:
+        """Rows that are used, and their σ. (m,), (m,)"""
+        if self._interval is None:
+            return snapshot.available, snapshot.sigma
+        near = intervals.covered(snapshot.age_s, *self._interval)
+        return snapshot.available & snapshot.fresh & near, snapshot.sigma_own
+
+    def moments(
+        self,
+        belief: Belief,
+        prior: Belief,
+        noise: FloatArray,
+        snapshot: Snapshot,
+        sigma: FloatArray,
+        used: BoolArray,
+    ) -> RowMoments:
+        """Moments of the used rows; see `RowMoments` for the states."""
+        at, key = np.flatnonzero(used), used.tobytes()
+        frame = self._model.frame(snapshot.z, sigma, used, at)
+        rows = self._rows.get(key, lambda: Rows(frame.pattern))
+        reach: Reach | None = None
+        if self._interval is not None:
+            ages = snapshot.age_s[at]
+            between = ages, self._interval.window_s[at], self._interval.step_s
+            reach = self._reaches.get(key + ages.tobytes(), lambda: self._reach(*between))
+        return RowMoments(
+            self._lagged, belief, prior, noise, rows, frame, reach, self._linearisation
+        )
+
+    def _reach(self, age_s: FloatArray, window_s: FloatArray, step_s: float) -> Reach:
+        ages, windows, kind = intervals.kinds(age_s, window_s)
+        between = ages, windows, step_s, self._lagged.lags
+        bridge = intervals.bridge_covariance(*between)
+        return Reach(intervals.weights(*between)[kind], bridge[kind[:, None], kind])

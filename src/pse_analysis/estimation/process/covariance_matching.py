@@ -24,9 +24,10 @@ from pse_analysis.estimation.process.load_noise import Sensitivity, at_least, in
 from pse_analysis.grid.network import Network
 from pse_analysis.measurement import BUS, P, Q, SensorLayout
 
-START = np.array([0.02, 0.02, 1e-3, 1e-4]) ** 2
-"""Levels before anything was seen: (share of nominal load)² alone and together, and p.u.² of the
-references and of other held voltages, where there are any."""
+START = np.array([0.02, 0.02, 1e-3]) ** 2
+"""Levels before anything was seen: (share of nominal load)² alone and together, and p.u.²"""
+HELD_START = 1e-4**2
+"""The same of held voltages other than the references. [p.u.²]"""
 WINDOW = 18
 """Steps after which the weight of an innovation has faded to 1/e.
 
@@ -189,7 +190,8 @@ def of_loads(
         shapes += [by_voltage[:, group] for group in groups]
         return tuple(turned_rows(shape, frame) for shape in shapes)
 
-    return CovarianceMatching(halves, START[: 2 + len(groups)], window)
+    start = START if len(groups) == 1 else np.append(START, HELD_START)
+    return CovarianceMatching(halves, start, window)
 
 
 def responses(

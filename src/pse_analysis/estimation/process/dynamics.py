@@ -20,11 +20,20 @@ from pse_analysis.errors import ParameterError
 class HoltParams:
     """Weights of the newest estimate in the level and of the newest slope in the trend.
 
-    The defaults are those of [qu2018].
+    The defaults of the weights are those of [qu2018].
+
+    Attributes
+    ----------
+    alpha, beta : float
+    as_printed : bool
+        Whether `holt` has the covariance F P Fᵀ of [qu2018] with F = α(1+β) I, which claims to know
+        more after every step without a measurement. Without it the level is as uncertain as the
+        estimate that it follows, F = I.
     """
 
     alpha: float = 0.85
     beta: float = 0.05
+    as_printed: bool = False
 
     def __post_init__(self) -> None:
         if not (0 < self.alpha <= 1 and 0 <= self.beta <= 1):
@@ -76,7 +85,7 @@ class _Smoothing(NamedTuple):
 
 
 def holt(params: HoltParams | None = None) -> Process:
-    """Holt's two-parameter smoothing in the paper's form, with F = α(1+β) I.
+    """Holt's two-parameter smoothing.
 
     Returns
     -------
@@ -84,13 +93,15 @@ def holt(params: HoltParams | None = None) -> Process:
 
     Notes
     -----
-    Eq. (3) of [qu2018]: a = α x̂ + (1-α) x̃, b = β (a - a₋₁) + (1-β) b₋₁, x̃⁺ = a + b. The
-    covariance F P Fᵀ + Q takes g for exogenous, although it holds earlier estimates: P is
-    optimistic. `local_trend` makes the same forecasts with the covariance that belongs to them.
+    Eq. (3) of [qu2018]: a = α x̂ + (1-α) x̃, b = β (a - a₋₁) + (1-β) b₋₁, x̃⁺ = a + b. Its
+    covariance F P Fᵀ + Q with F = α(1+β) I takes g for exogenous, although it holds earlier
+    estimates: P is optimistic, see ``as_printed``. The error of the level has the covariance
+    (1-α)² P⁻ + (1 - (1-α)²) P, hardly more than P, which counts otherwise; that of the slope is
+    left out. `local_trend` makes the same forecasts with the covariance that belongs to them.
     """
     params = params or HoltParams()
     alpha, beta = params.alpha, params.beta
-    factor = alpha * (1.0 + beta)
+    factor = alpha * (1.0 + beta) if params.as_printed else 1.0
 
     def begin(
         x: FloatArray, covariance: FloatArray, _noise: FloatArray

@@ -55,7 +55,7 @@ class LoadStatistics:
         σ of the change of [P; Q] in one step, by slot of the day. [p.u.]
     correlation : (2N, 2N) ndarray
         Correlation of these changes.
-    held : (n_held,) ndarray
+    held : float or (n_held,) ndarray
         σ of the change of every held voltage in one step, see `Sensitivity.held`. [p.u.]
     slot_s : float
         Length of a slot. [s]
@@ -63,7 +63,7 @@ class LoadStatistics:
 
     deviation: FloatArray
     correlation: FloatArray
-    held: FloatArray
+    held: float | FloatArray
     slot_s: float
 
     def deviation_at(self, time: np.datetime64) -> FloatArray:

@@ -99,12 +99,35 @@ def known(voltages: VoltageNoise, process: Process) -> Noise:
 
 
 class _Moments(NamedTuple):
-    """Mean and covariance so far, the covariance before all, and how many steps they rest on."""
+    """What was learnt of the noise.
+
+    Attributes
+    ----------
+    mean : (N,) ndarray
+    covariance : (N, N) ndarray
+    start : (N, N) ndarray
+        Covariance before all.
+    steps : int
+    square : float
+        Mean of |x̂ - F x̂₋₁ - g|².
+    weights : float
+        Sum of the squared weights of the steps in these means.
+    """
 
     mean: FloatArray
     covariance: FloatArray
     start: FloatArray
     steps: int
+    square: float = 0.0
+    weights: float = 0.0
+
+    @property
+    def drift(self) -> FloatArray:
+        """The mean, as far as it is more than what few steps make of noise of mean 0. (N,)"""
+        length = float(self.mean @ self.mean)
+        if length == 0.0:
+            return self.mean
+        return max(1.0 - self.weights * self.square / length, 0.0) * self.mean
 
 
 def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97) -> Noise:
@@ -133,6 +156,9 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
     Q ← (1-d) Q + d (K ηηᵀ Kᵀ + P - F P₋₁ Fᵀ). Where the latter is not positive definite, P - F P₋₁
     Fᵀ is left out, which is biased but never negative.
 
+    The mean of so few steps is never zero, and a filter that follows it drifts. It is therefore
+    shrunk as James and Stein shrink a mean, q (1 - Σw² E|x̂ - F x̂₋₁ - g|²/|q|²)₊.
+
     Fading memory holds (1+b)/(1-b) steps, few more than a grid has voltages, and the covariance of
     so few samples is far too small in some directions. What the filter uses is therefore drawn
     towards the shape of the start, by the share n/(n + steps in memory) and at the size learnt.
@@ -149,11 +175,11 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
     ) -> tuple[FloatArray, FloatArray, _Moments]:
         n, size = len(memory.start), float(np.trace(memory.start))
         if memory.steps == 0 or size == 0.0:
-            return memory.mean, memory.covariance, memory
+            return memory.drift, memory.covariance, memory
         share = n / (n + min(memory.steps, (1.0 + forgetting) / (1.0 - forgetting)))
         scale = float(np.trace(memory.covariance)) / size
         drawn = (1.0 - share) * memory.covariance + (share * scale) * memory.start
-        return memory.mean, drawn, memory
+        return memory.drift, drawn, memory
 
     def learn(memory: _Moments, step: Learnt) -> _Moments:
         count = memory.steps + 1
@@ -162,7 +188,10 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
         safe = np.outer(share * step.correction, step.correction)
         safe += (1.0 - share) * memory.covariance
         unbiased = safe + share * (step.posterior - step.forecast)
-        return _Moments(mean, unbiased if _positive(unbiased) else safe, memory.start, count)
+        square = (1.0 - share) * memory.square + share * float(step.moved @ step.moved)
+        weights = (1.0 - share) ** 2 * memory.weights + share**2
+        covariance = unbiased if _positive(unbiased) else safe
+        return _Moments(mean, covariance, memory.start, count, square, weights)
 
     return Noise(begin, current, learn, voltages)
 
