@@ -5,7 +5,8 @@ from __future__ import annotations
 from pse_analysis.grid.continuation.curve import Curve, EndKind
 from pse_analysis.grid.continuation.equations import LoadedGrid
 from pse_analysis.grid.continuation.loading import Loading
-from pse_analysis.grid.continuation.tracing import ContinuationParams, continuation, trace
+from pse_analysis.grid.continuation.params import ContinuationParams
+from pse_analysis.grid.continuation.tracing import continuation, trace
 
 __all__ = [
     "ContinuationParams",

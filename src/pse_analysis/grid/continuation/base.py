@@ -15,6 +15,7 @@ from pse_analysis.grid.network import Network
 from pse_analysis.grid.power_flow import PowerFlow, solve
 from pse_analysis.measurement import BUS, MeasurementModel, P, Q, SensorLayout
 
+StatusArray = npt.NDArray[np.int8]
 LOAD, VOLTAGE, UPPER, LOWER = range(4)
 """What a bus holds: its load, its voltage, or its generation's upper or lower reactive limit."""
 
@@ -45,7 +46,7 @@ class BaseState:
     vm: FloatArray
     p_pu: FloatArray
     q_pu: FloatArray
-    status: npt.NDArray[np.int8]
+    status: StatusArray
     vm_set: FloatArray
     upper: FloatArray
     lower: FloatArray

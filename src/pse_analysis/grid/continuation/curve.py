@@ -6,11 +6,10 @@ import enum
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from pse_analysis.arrays import BoolArray, FloatArray, IntArray
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import NotConverged
-from pse_analysis.grid.continuation.base import UPPER
+from pse_analysis.grid.continuation.base import LOWER, UPPER, VOLTAGE, StatusArray
 from pse_analysis.grid.continuation.equations import Condition, LoadedGrid, coordinate
 
 
@@ -38,7 +37,7 @@ class Located:
 
     grid: LoadedGrid
     y: FloatArray
-    status: npt.NDArray[np.int8]
+    status: StatusArray
     gradient: FloatArray
     base_gradient: FloatArray
 
@@ -100,7 +99,7 @@ class Curve:
     grid: LoadedGrid
     y: FloatArray
     slope: FloatArray
-    status: npt.NDArray[np.int8]
+    status: StatusArray
     event: tuple[str, ...]
     nose: int
     end: EndKind
@@ -111,7 +110,7 @@ class Curve:
     @property
     def loading(self) -> FloatArray:
         """λ of each point. (n_points,)"""
-        return self.y[-1]
+        return np.asarray(self.y[-1])
 
     @property
     def theta(self) -> FloatArray:
@@ -138,7 +137,7 @@ class Curve:
         """Points from the start to the nose. (n_points,)"""
         return np.arange(self.y.shape[1]) <= self.nose
 
-    def jacobian(self, point: int) -> npt.NDArray[np.float64]:
+    def jacobian(self, point: int) -> FloatArray:
         """Returns the Jacobian of the power flow at a point, by θ, |V| and σ. (2N + 1, 2N + 1)
 
         Its least singular value tends to zero at a saddle node.
@@ -199,8 +198,8 @@ class Curve:
             left = grid.left_null(y, status, self.nose_tangent)
             gradient = grid.nose_gradient(y, status, self.nose_tangent, left)
         else:
-            limited: IntArray = np.asarray(self.status[self.nose], dtype=np.int64)
-            if limited[self.nose_bus] not in (0, 1):
+            # The bus that ends it stands at its limit on one side of the nose.
+            if self.status[self.nose, self.nose_bus] in (UPPER, LOWER):
                 status = self.status[self.nose].copy()
             gradient = np.zeros(len(y))
             gradient[grid.n + self.nose_bus] = 1.0
@@ -212,6 +211,6 @@ class Curve:
 def switching(grid: LoadedGrid, bus: int, status: int) -> str:
     """Returns the sentence that tells of a bus that takes up or gives up voltage control."""
     name = grid.network.buses.name[bus]
-    if status == 1:
+    if status == VOLTAGE:
         return f"bus {name} holds its voltage again"
     return f"bus {name} at its {'upper' if status == UPPER else 'lower'} reactive limit"

@@ -21,9 +21,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from pse_analysis.arrays import BoolArray, FloatArray, IntArray
+from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import GridError
-from pse_analysis.grid.continuation.base import LOAD, LOWER, UPPER, VOLTAGE, BaseState
+from pse_analysis.grid.continuation.base import LOAD, LOWER, UPPER, VOLTAGE, BaseState, StatusArray
 from pse_analysis.grid.continuation.loading import Direction
 from pse_analysis.grid.network import Network
 from pse_analysis.grid.newton import rounding_pu
@@ -72,12 +72,11 @@ class LoadedGrid:
         # A reference, or a generator without any reactive range, never changes what it holds.
         self.controlled = self.alive & (base.status != LOAD) & (base.upper - base.lower > 1e-9)
         self.controlled[self.reference] = False
-        self.fixed = VOLTAGE * np.ones(n, dtype=np.int8)
         self._compile()
 
     # ---------------------------------------------------------------------------- equations
 
-    def residual(self, y: FloatArray, status: IntArray) -> FloatArray:
+    def residual(self, y: FloatArray, status: StatusArray) -> FloatArray:
         """Returns the residuals of the equations, without the condition. (2N + 1,) [p.u., rad]"""
         n, base = self.n, self.base
         theta, vm, sigma, loading = y[:n], y[n : 2 * n], y[2 * n], y[2 * n + 1]
@@ -89,10 +88,11 @@ class LoadedGrid:
         q[held] = (vm - base.vm_set)[held]
         return np.concatenate([p, q, [theta[self.reference] - base.theta[self.reference]]])
 
-    def q_given(self, status: IntArray) -> FloatArray:
+    def q_given(self, status: StatusArray) -> FloatArray:
         """Returns the reactive injections that buses without voltage control have at λ = 0."""
         base = self.base
-        return np.select([status == UPPER, status == LOWER], [base.upper, base.lower], base.q_pu)
+        limits = [base.upper, base.lower]
+        return np.asarray(np.select([status == UPPER, status == LOWER], limits, base.q_pu))
 
     def tolerance(self, y: FloatArray, tolerance: float) -> FloatArray:
         """Returns the residual that counts as solved; rounding limits it. (2N + 1,)"""
@@ -127,7 +127,7 @@ class LoadedGrid:
         own = (model.indices == model.row_of_entry) & (model.row_of_entry >= n)
         self._own_size = np.flatnonzero(own)
 
-    def jacobian_data(self, x: FloatArray, status: IntArray) -> FloatArray:
+    def jacobian_data(self, x: FloatArray, status: StatusArray) -> FloatArray:
         """Returns ∂(P, Q)/∂x with unit rows where a bus holds its voltage or is dead. (nnz,)"""
         unit = np.concatenate([~self.alive, status == VOLTAGE])
         data = np.where(unit[self.model.row_of_entry], 0.0, self.model.jacobian_data(x))
@@ -136,7 +136,7 @@ class LoadedGrid:
         return data
 
     def factor(
-        self, y: FloatArray, status: IntArray, gradient: FloatArray
+        self, y: FloatArray, status: StatusArray, gradient: FloatArray
     ) -> sparse_linalg.SuperLU | None:
         """Returns the factorised matrix [∂F/∂y; ∂g/∂y], or None where it is singular.
 
@@ -163,9 +163,7 @@ class LoadedGrid:
         )
         if not np.isfinite(data).all():
             return None
-        matrix = sparse.csc_array(
-            (data[self._order], self._rows, self._starts), shape=(size, size)
-        )
+        matrix = sparse.csc_array((data[self._order], self._rows, self._starts), shape=(size, size))
         try:
             return sparse_linalg.splu(matrix)
         except RuntimeError:  # exactly singular
@@ -176,7 +174,7 @@ class LoadedGrid:
     def solve(
         self,
         y: FloatArray,
-        status: IntArray,
+        status: StatusArray,
         condition: Condition,
         *,
         tolerance: float = 1e-10,
@@ -225,9 +223,7 @@ class LoadedGrid:
                 y = moved
         return None
 
-    def tangent(
-        self, y: FloatArray, status: IntArray, along: FloatArray
-    ) -> FloatArray | None:
+    def tangent(self, y: FloatArray, status: StatusArray, along: FloatArray) -> FloatArray | None:
         """Returns the direction of the curve whose product with ``along`` is 1. (2N + 2,)"""
         factor = self.factor(y, status, along)
         if factor is None:
@@ -237,7 +233,7 @@ class LoadedGrid:
         found = factor.solve(right)
         return found if np.isfinite(found).all() else None
 
-    def left_null(self, y: FloatArray, status: IntArray, tangent: FloatArray) -> FloatArray:
+    def left_null(self, y: FloatArray, status: StatusArray, tangent: FloatArray) -> FloatArray:
         """Returns w with wᵀ ∂F/∂(x, σ) = 0 and wᵀ ∂F/∂λ = 1 at a saddle node. (2N + 1,)
 
         Parameters
@@ -255,7 +251,7 @@ class LoadedGrid:
         return np.asarray(factor.solve(right, trans="T")[:-1])
 
     def nose_gradient(
-        self, y: FloatArray, status: IntArray, tangent: FloatArray, left: FloatArray
+        self, y: FloatArray, status: StatusArray, tangent: FloatArray, left: FloatArray
     ) -> FloatArray:
         """Returns the gradient of wᵀ J(y) r, which vanishes at a saddle node. (2N + 2,)
 
@@ -270,7 +266,7 @@ class LoadedGrid:
         change = self.model.matrix((after - before) / (2.0 * step))
         return np.concatenate([left[:n2] @ change, [0.0, 0.0]])
 
-    def base_derivative(self, adjoint: FloatArray, status: IntArray) -> FloatArray:
+    def base_derivative(self, adjoint: FloatArray, status: StatusArray) -> FloatArray:
         """Returns νᵀ ∂F/∂x0, the effect of the base state on the equations. (2N,)
 
         Parameters

@@ -10,7 +10,6 @@ import numpy as np
 
 from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import GridError
-from pse_analysis.grid.elements import BusKind
 from pse_analysis.grid.network import Network
 
 
@@ -169,11 +168,6 @@ class Loading:
         return Direction((gen - load) / base, reactive / base, weight / weight.sum())
 
 
-def generating(network: Network) -> BoolArray:
-    """Returns which buses hold a voltage, as generators do. (n_bus,)"""
-    return np.asarray(network.buses.kind != BusKind.PQ)
-
-
 def _named(network: Network, values: FloatArray) -> dict[str, float]:
     return {network.buses.name[i]: float(values[i]) for i in np.flatnonzero(values)}
 
@@ -184,9 +178,7 @@ def _members(network: Network, names: Iterable[str]) -> BoolArray:
     return inside
 
 
-def _values(
-    network: Network, loading: str, key: str, by_name: Mapping[str, float]
-) -> FloatArray:
+def _values(network: Network, loading: str, key: str, by_name: Mapping[str, float]) -> FloatArray:
     values = np.zeros(network.n_bus)
     for name, value in by_name.items():
         if not np.isfinite(value):

@@ -2,69 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pse_analysis.arrays import FloatArray, IntArray
-from pse_analysis.errors import GridError, NotConverged, ParameterError
-from pse_analysis.grid.continuation.base import LOWER, UPPER, VOLTAGE, BaseState
+from pse_analysis.errors import GridError, NotConverged
+from pse_analysis.grid.continuation.base import LOWER, UPPER, VOLTAGE, BaseState, StatusArray
 from pse_analysis.grid.continuation.curve import Curve, EndKind, switching
 from pse_analysis.grid.continuation.equations import LoadedGrid, coordinate, distance
 from pse_analysis.grid.continuation.loading import Loading
+from pse_analysis.grid.continuation.params import ContinuationParams
 from pse_analysis.grid.network import Network
 
-Status = npt.NDArray[np.int8]
 _MARGIN = 1e-8
 """How far beyond a limit a bus counts as beyond it. [p.u.]"""
 _LEAST_STEP = 1e-9
 """Step below which a curve counts as stuck, in units of the largest."""
 _FOLD = 1e-11
 """dλ/ds at a nose, in units of the first one."""
-
-
-@dataclass(frozen=True)
-class ContinuationParams:
-    """How a curve is traced.
-
-    Attributes
-    ----------
-    first_step, largest_step : float
-        Largest change of an angle or a voltage from one point to the next. [rad, p.u.]
-    past_nose : int
-        Points traced past the nose.
-    max_points : int
-        Points after which a curve without a nose is given up.
-    tolerance : float
-        Largest mismatch of a point. [p.u.]
-    enforce_q_limits : bool
-        Let generators give up their voltage at their reactive limits, and take it up again.
-    """
-
-    first_step: float = 0.02
-    largest_step: float = 0.1
-    past_nose: int = 3
-    max_points: int = 2000
-    tolerance: float = 1e-9
-    enforce_q_limits: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0 < self.first_step <= self.largest_step <= 1.0:
-            raise ParameterError(
-                "continuation: steps must satisfy 0 < first_step ≤ largest_step ≤ 1 rad or p.u., "
-                f"received {self.first_step:g} and {self.largest_step:g}"
-            )
-        if self.past_nose < 0 or self.max_points < 2:
-            raise ParameterError(
-                "continuation: past_nose must be 0 at least and max_points 2, received "
-                f"{self.past_nose} and {self.max_points}"
-            )
-        if not 1e-13 <= self.tolerance <= 1e-3:
-            raise ParameterError(
-                f"continuation: tolerance must lie in 1e-13 … 1e-3 p.u., received {self.tolerance}"
-            )
 
 
 def continuation(
@@ -137,7 +93,7 @@ class _Point(NamedTuple):
     """A point of the curve: what buses hold after it, the tangent there, and what happened."""
 
     y: FloatArray
-    status: Status
+    status: StatusArray
     tangent: FloatArray
     event: str = ""
     bus: int = -1
@@ -246,7 +202,7 @@ class _Tracer:
             "start from a lower λ"
         )
 
-    def _oriented_start(self, y: FloatArray, status: Status) -> _Point:
+    def _oriented_start(self, y: FloatArray, status: StatusArray) -> _Point:
         grid, n2 = self.grid, 2 * self.n
         along = np.zeros(len(y))
         along[-1] = 1.0
@@ -315,7 +271,7 @@ class _Tracer:
 
     # ------------------------------------------------------------------------------- events
 
-    def _excess(self, y: FloatArray, status: Status) -> tuple[FloatArray, IntArray]:
+    def _excess(self, y: FloatArray, status: StatusArray) -> tuple[FloatArray, IntArray]:
         """Returns by how much each generator is beyond what it holds, and what it should hold."""
         grid = self.grid
         to_upper, to_lower = grid.q_margin(y)
@@ -329,7 +285,7 @@ class _Tracer:
         target = np.where(held, np.where(to_upper < to_lower, UPPER, LOWER), VOLTAGE)
         return np.where(grid.controlled, excess, -np.inf), target
 
-    def _beyond(self, y: FloatArray, status: Status) -> dict[int, int]:
+    def _beyond(self, y: FloatArray, status: StatusArray) -> dict[int, int]:
         excess, target = self._excess(y, status)
         return {int(i): int(target[i]) for i in np.flatnonzero(excess > _MARGIN)}
 
