@@ -146,7 +146,7 @@ class BaseState:
         vm_set = vm.copy()
         vm_set[at_upper] = np.maximum(vm, buses.vm_set_pu)[at_upper]
         vm_set[at_lower] = np.minimum(vm, buses.vm_set_pu)[at_lower]
-        above, below = controlled & (q > upper), controlled & (q < lower)
+        above, below = controlled & (q > upper + margin), controlled & (q < lower - margin)
         return cls(
             theta=x[:n],
             vm=vm,

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pse_analysis.arrays import BoolArray, FloatArray
 from pse_analysis.errors import NotConverged
 from pse_analysis.grid.continuation.base import LOWER, UPPER, VOLTAGE, StatusArray
-from pse_analysis.grid.continuation.equations import Condition, LoadedGrid, coordinate
+from pse_analysis.grid.continuation.equations import (
+    Condition,
+    LoadedGrid,
+    coordinate,
+    distance,
+)
 
 
 class EndKind(enum.StrEnum):
@@ -45,6 +50,10 @@ class Located:
     def loading(self) -> float:
         """λ of the state."""
         return float(self.y[-1])
+
+    def with_base_gradient(self, base_gradient: FloatArray) -> Located:
+        """The same state, with what its condition owes to the base state."""
+        return replace(self, base_gradient=base_gradient)
 
     def sensitivity(self, output: FloatArray) -> FloatArray:
         """Returns how a quantity of the located state moves with the base state. (2N,)
@@ -174,6 +183,16 @@ class Curve:
         if y is None:
             return None
         return Located(self.grid, y, status, condition(y)[1], np.zeros(2 * self.grid.n))
+
+    def between(self, segment: int, fraction: float) -> Located | None:
+        """Returns the state at a share of the way from a point to the next one."""
+        start, end = self.y[:, segment], self.y[:, segment + 1]
+        chord = end - start
+        chord[2 * self.grid.n :] = 0.0
+        size = float(np.linalg.norm(chord))
+        if size == 0.0:
+            return None
+        return self.located(distance(start, chord / size, fraction * size), segment, fraction)
 
     def at(self, loading: float) -> Located | None:
         """Returns the state before the nose at a loading; None beyond what was traced."""

@@ -231,7 +231,7 @@ class LoadedGrid:
         right = np.zeros(len(y))
         right[-1] = 1.0
         found = factor.solve(right)
-        return found if np.isfinite(found).all() else None
+        return np.asarray(found) if np.isfinite(found).all() else None
 
     def left_null(self, y: FloatArray, status: StatusArray, tangent: FloatArray) -> FloatArray:
         """Returns w with wᵀ ∂F/∂(x, σ) = 0 and wᵀ ∂F/∂λ = 1 at a saddle node. (2N + 1,)

@@ -1,0 +1,24 @@
+"""The maximum allowed power flow of a section, with its standard error."""
+
+from __future__ import annotations
+
+from pse_analysis.scoring.transfer_limit.limit import TransferLimit, transfer_limit
+from pse_analysis.scoring.transfer_limit.params import (
+    DESCRIPTION,
+    Contingency,
+    Criterion,
+    TransferLimitParams,
+)
+from pse_analysis.scoring.transfer_limit.sections import BranchEnd, Section, SectionPower
+
+__all__ = [
+    "DESCRIPTION",
+    "BranchEnd",
+    "Contingency",
+    "Criterion",
+    "Section",
+    "SectionPower",
+    "TransferLimit",
+    "TransferLimitParams",
+    "transfer_limit",
+]
