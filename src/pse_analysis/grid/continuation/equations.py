@@ -94,11 +94,18 @@ class LoadedGrid:
         limits = [base.upper, base.lower]
         return np.asarray(np.select([status == UPPER, status == LOWER], limits, base.q_pu))
 
-    def tolerance(self, y: FloatArray, tolerance: float) -> FloatArray:
-        """Returns the residual that counts as solved; rounding limits it. (2N + 1,)"""
+    def _solved(self, y: FloatArray, residual: FloatArray, tolerance: float) -> bool:
+        """Returns whether residuals are as small as asked for, or as rounding allows."""
+        size = np.abs(residual)
+        worst = float(size.max())
+        if worst <= tolerance:
+            return True
+        if not worst <= 1e3 * tolerance:
+            return False
         n = self.n
         rounding = rounding_pu(self.network, y[n : 2 * n])
-        return np.maximum(np.concatenate([rounding, rounding, [0.0]]), tolerance)
+        least = np.maximum(np.concatenate([rounding, rounding, [0.0]]), tolerance)
+        return bool((size <= least).all())
 
     def q_margin(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Returns what is left to the upper and to the lower reactive limit. (N,), (N,) [p.u.]"""
@@ -206,8 +213,8 @@ class LoadedGrid:
             for _ in range(max_iterations + 1):
                 if not np.isfinite(residual).all():
                     return None
-                least = np.append(self.tolerance(y, tolerance), _condition_tolerance(y, gradient))
-                if (np.abs(residual) <= least).all():
+                met = abs(value) <= _condition_tolerance(y, gradient)
+                if met and self._solved(y, residual[:-1], tolerance):
                     return y
                 factor = self.factor(y, status, gradient)
                 if factor is None:

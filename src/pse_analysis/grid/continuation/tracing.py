@@ -19,7 +19,7 @@ _MARGIN = 1e-8
 """How far beyond a limit a bus counts as beyond it. [p.u.]"""
 _LEAST_STEP = 1e-9
 """Step below which a curve counts as stuck, in units of the largest."""
-_FOLD = 1e-11
+_FOLD = 1e-9
 """dλ/ds at a nose, in units of the first one."""
 
 

@@ -9,6 +9,7 @@ from pse_analysis.scoring.transfer_limit.params import (
     Criterion,
     TransferLimitParams,
 )
+from pse_analysis.scoring.transfer_limit.sampling import SampledLimit, sampled_limit
 from pse_analysis.scoring.transfer_limit.sections import BranchEnd, Section, SectionPower
 
 __all__ = [
@@ -16,9 +17,11 @@ __all__ = [
     "BranchEnd",
     "Contingency",
     "Criterion",
+    "SampledLimit",
     "Section",
     "SectionPower",
     "TransferLimit",
     "TransferLimitParams",
+    "sampled_limit",
     "transfer_limit",
 ]

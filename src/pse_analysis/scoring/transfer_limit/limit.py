@@ -188,7 +188,7 @@ class _Intact:
         self._check_rise()
         self.scale = self.curve.limit
         self.curve, constraints = safely_traced(
-            self.grid, params.continuation, self._constraints, self.scale
+            self.grid, params.continuation, self._constraints, self.scale, self.curve
         )
         largest = largest_power(self.curve, self.power, gradients=setting.gradients)
         if largest.power_mw <= 0:

@@ -174,11 +174,12 @@ def safely_traced(
     params: ContinuationParams,
     constraints: Callable[[Curve], dict[Criterion, Constraint]],
     scale: float,
+    from_base: Curve | None = None,
 ) -> tuple[Curve, dict[Criterion, Constraint]]:
     """Returns a curve that starts where no constraint is violated, and its constraints.
 
     It starts at the base load where that is safe, else at a lower one; at the lowest where none
-    is safe.
+    is safe. ``from_base`` is the curve from the base load where that is traced already.
 
     Raises
     ------
@@ -188,7 +189,8 @@ def safely_traced(
     found, failure = None, None
     for share in STARTS:
         try:
-            curve = trace(grid, params, start=share * scale)
+            traced = from_base if share == 0.0 else None
+            curve = traced or trace(grid, params, start=share * scale)
         except NotConverged as error:
             failure = failure or error
             continue
