@@ -199,9 +199,7 @@ class _Intact:
             )
         self.rows = [("", _scaled(largest, params.power_share))]
         for criterion, constraint in constraints.items():
-            met = where(
-                self.curve, self.power, criterion, constraint, gradients=setting.gradients
-            )
+            met = where(self.curve, self.power, criterion, constraint, gradients=setting.gradients)
             self.rows.append(("", met))
         self.points = [curve_points(self.curve, self.power, setting, "")]
 
