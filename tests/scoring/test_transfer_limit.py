@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import time
 from collections.abc import Callable
 from functools import cache, partial
@@ -14,7 +16,8 @@ from reference import conventional
 from pse_analysis.errors import GridError, NotConverged, ParameterError, TableError
 from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import Network, library
-from pse_analysis.grid.continuation import ContinuationParams, Loading
+from pse_analysis.grid.continuation import ContinuationParams, LoadedGrid, Loading, trace
+from pse_analysis.grid.continuation.base import BaseState
 from pse_analysis.grid.power_flow import PowerFlow, solve
 from pse_analysis.pipeline.processes import each
 from pse_analysis.scoring.transfer_limit import (
@@ -42,9 +45,9 @@ def section14() -> Section:
     return Section.around(grid14(), "I", SENDING)
 
 
-def plain(network: Network = grid14()) -> Loading:
+def plain() -> Loading:
     """A transfer that the slack bus balances, as in plain power flow."""
-    loading = Loading.transfer(network, "plain", SENDING, RECEIVING, by_load=True)
+    loading = Loading.transfer(grid14(), "plain", SENDING, RECEIVING, by_load=True)
     return Loading(
         "plain", loading.p_gen_mw, loading.p_load_mw, loading.q_load_mvar, balance={"1": 1.0}
     )
@@ -290,18 +293,32 @@ def test_hundred_and_eighteen_buses_with_ten_outages_and_three_vectors_take_twen
     assert limit.mapf_mw > limit.base_mw
 
 
-def test_outage_that_cuts_off_a_generator_leaves_the_rest_to_the_others() -> None:
+def losses_mw(network: Network, x: np.ndarray) -> float:
+    """Sum of R |I|² over the branches in service."""
+    n, branch = network.n_bus, network.branches
+    voltage = x[n:] * np.exp(1j * x[:n])
+    tap = branch.tap * np.exp(1j * branch.shift_rad)
+    drop = voltage[branch.from_bus] / tap - voltage[branch.to_bus]
+    current = drop / (branch.r_pu + 1j * branch.x_pu)
+    loss = branch.in_service * branch.r_pu * np.abs(current) ** 2
+    return float(loss.sum() * network.base_mva)
+
+
+def test_outage_that_cuts_off_a_generator_leaves_its_power_to_those_that_balance() -> None:
     # 9-10 is the only way out of bus 10, which generates 450 MW.
     network = library.load("ieee118")
-    section = Section.around(network, "west", WEST)
-    rest = [bus for bus in network.buses.name if bus not in WEST]
-    loading = Loading.transfer(network, "load", WEST, rest, by_load=True)
-    limit = transfer_limit(network, section, [loading], contingencies=["9-10"])
-    assert row(limit, "stability_after_outage", "9-10")["state"] == "found"
-    curve = limit.curves[limit.curves["contingency"] == "9-10"]
-    whole = limit.curves[limit.curves["contingency"] == ""]
-    # Generators on both sides take up what bus 10 gave, so less flows west to east at first.
-    assert curve["p_mw"].iloc[0] < whole["p_mw"].iloc[0] + 1e-9
+    loading = Loading("east", p_load_mw={"59": 1.0}, balance={"25": 1.0, "26": 3.0, "10": 5.0})
+    base = BaseState.solved(network)
+    grid = LoadedGrid(network.open_branch("9-10"), base, loading.direction(network))
+    curve = trace(grid)
+    rise = grid.model.h(curve.x[:, 0])[: network.n_bus] - base.p_pu
+    by_25, by_26 = (rise[network.bus(name)] * network.base_mva for name in ("25", "26"))
+    assert by_26 == pytest.approx(3 * by_25, rel=1e-6)
+    more_losses = losses_mw(grid.network, curve.x[:, 0]) - losses_mw(network, base.x)
+    assert by_25 + by_26 == pytest.approx(450.0 + more_losses, abs=1e-3)
+    others = [k for k, name in enumerate(network.buses.name) if name not in ("10", "25", "26")]
+    np.testing.assert_allclose(rise[others], 0.0, atol=1e-8)
+    assert curve.limit > 0
 
 
 # --------------------------------------------------------------------------- standard error
@@ -328,8 +345,8 @@ LOADINGS = (Loading.transfer(grid14(), "south", SENDING, ["11", "12", "13", "14"
         TransferLimitParams(power_share=0.6),
         TransferLimitParams(power_share_after=0.7),
         TransferLimitParams(),
-        TransferLimitParams(continuous_ka={"5-6": 0.5}),
-        TransferLimitParams(emergency_ka={"2-4": 0.45}),
+        TransferLimitParams(continuous_ka={"4-5": 0.3}),
+        TransferLimitParams(emergency_ka={"4-5": 0.33}),
         TransferLimitParams(
             power_share=0.6, continuation=ContinuationParams(enforce_q_limits=False)
         ),
@@ -390,7 +407,7 @@ def test_sampling_sees_criteria_change_places() -> None:
     assert set(sampled.binding["criterion"]) == {"voltage", "stability"}
     assert sampled.binding["share"].sum() == pytest.approx(1.0)
     # The lower of two is lower than either on average.
-    assert sampled.mean_mw < usual.mapf_mw
+    assert sampled.mean_mw < voltage["value_mw"]
 
 
 # -------------------------------------------------------------------------------- bad input
@@ -446,18 +463,54 @@ def test_outage_of_the_whole_section_is_refused() -> None:
         transfer_limit(grid14(), section, [loading], contingencies=["7-8"])
 
 
-def test_outage_without_a_state_leaves_no_limit_and_says_why() -> None:
-    # Without both circuits to bus 2's side nothing can feed the heavy load at bus 3 any more.
-    outage = Contingency("ring", ("4-5", "2-4", "3-4"))
-    tight = TransferLimitParams(continuation=ContinuationParams())
-    limit = transfer_limit(grid14(), section14(), [plain()], tight, contingencies=[outage, "2-4"])
-    unresolved = limit.table[limit.table["state"] == "unresolved"]
-    if unresolved.empty:
-        pytest.fail("the outage was expected to leave some criterion undetermined")
+def with_load_at_3(p_mw: float) -> Network:
+    buses = grid14().buses
+    load = np.where(np.array(buses.name) == "3", p_mw, buses.p_load_mw)
+    return dataclasses.replace(grid14(), buses=dataclasses.replace(buses, p_load_mw=load))
+
+
+@pytest.mark.parametrize(
+    ("trip", "reason"),
+    [
+        ("2-3", r"after 2-3 along south is undetermined: there is no state at any loading"),
+        ("3-4", r"after 3-4 along south \(bus/3\) is undetermined: violated at every loading"),
+    ],
+)
+def test_outage_that_no_loading_helps_leaves_no_limit_and_says_why(trip: str, reason: str) -> None:
+    # Bus 3 stands in the sending area: less power over the section does not relieve it.
+    heavy = with_load_at_3(200.0)
+    limit = transfer_limit(heavy, section14(), LOADINGS, contingencies=[trip, "2-4"])
     assert np.isnan(limit.mapf_mw)
     assert not limit.table["binding"].any()
-    assert "no limit is given" in limit.findings[0]
-    assert "ring" in limit.findings[0]
+    assert limit.criterion == limit.loading == ""
+    assert re.search(reason, limit.findings[0])
+    assert np.isfinite(row(limit, "stability")["value_mw"])
+    assert np.isfinite(row(limit, "stability_after_outage", "2-4")["value_mw"])
+
+
+def test_base_case_without_solution_is_refused() -> None:
+    with pytest.raises(NotConverged, match=r"base case of ieee14 has no solution.*lower its load"):
+        transfer_limit(with_load_at_3(500.0), section14(), LOADINGS)
+
+
+def test_limit_may_lie_below_what_flows_now() -> None:
+    # Only 3-4 is left of the section, which cannot carry the base load.
+    outage = Contingency("three", ("2-4", "4-5", "5-6"))
+    limit = transfer_limit(grid14(), section14(), [plain()], contingencies=[outage])
+    after = grid14()
+    for branch in outage.branches:
+        after = after.open_branch(branch)
+    assert not solvable(after, 0.0)
+    largest = switch_point(lambda f: solvable(after, f - 100.0)) - 100.0
+    most = 0.92 * power_of(after, flow_at(after, largest))
+    factor = switch_point(
+        lambda f: solvable(after, f - 100.0) and power_of(after, flow_at(after, f - 100.0)) < most
+    )
+    found = row(limit, "stability_after_outage", "three")
+    assert found["power_mw"] == pytest.approx(
+        power_of(grid14(), flow_at(grid14(), factor - 100.0)), rel=2e-3
+    )
+    assert limit.mapf_mw < limit.base_mw
 
 
 def test_arguments_that_do_not_fit_are_refused() -> None:

@@ -199,8 +199,10 @@ def safely_traced(
         if not any((c.values(curve.x[:, :1]) > _VIOLATED).any() for c in own.values()):
             break
     if found is None:
-        assert failure is not None
-        raise failure
+        raise NotConverged(
+            f"there is no state at any loading down to λ = {STARTS[-1] * scale:g}: the section's "
+            f"power does not help, so leave this out or mend the grid ({failure})"
+        ) from failure
     return found
 
 

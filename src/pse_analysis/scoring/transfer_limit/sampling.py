@@ -116,17 +116,18 @@ def sampled_limit(
     near = _near(limit.table)
     wanted = tuple(loading for loading in loadings if loading.name in set(near["loading"]))
     outages = [c if isinstance(c, Contingency) else Contingency(c, (c,)) for c in contingencies]
-    common = {
-        "network": network,
-        "section": section,
-        "loadings": wanted,
+    mean = _Sample(
+        state=state,
+        network=network,
+        section=section,
+        loadings=wanted,
         # What lies past the nose is only for show.
-        "params": replace(params, continuation=replace(params.continuation, past_nose=0)),
-        "contingencies": tuple(c for c in outages if c.name in set(near["contingency"])),
-    }
+        params=replace(params, continuation=replace(params.continuation, past_nose=0)),
+        contingencies=tuple(c for c in outages if c.name in set(near["contingency"])),
+    )
     states = state + rng.standard_normal((count, len(state))) @ _root(covariance).T
     found = []
-    for number, one in enumerate(run(_limit_of, [_Sample(x, **common) for x in states]), start=1):
+    for number, one in enumerate(run(_limit_of, [replace(mean, state=x) for x in states]), start=1):
         found.append(one)
         if progress is not None:
             progress(number, count)
