@@ -19,6 +19,8 @@ _MARGIN = 1e-8
 """How far beyond a limit a bus counts as beyond it. [p.u.]"""
 _LEAST_STEP = 1e-9
 """Step below which a curve counts as stuck, in units of the largest."""
+_SAME = 1e-9
+"""Change of a state that is no move along the curve. [rad, p.u.]"""
 _FOLD = 1e-9
 """dλ/ds at a nose, in units of the first one."""
 
@@ -90,13 +92,17 @@ def trace(
 
 
 class _Point(NamedTuple):
-    """A point of the curve: what buses hold after it, the tangent there, and what happened."""
+    """A point of the curve: what buses hold after it, the tangent there, and what happened.
+
+    ``switched`` are all buses that changed what they hold at this very state.
+    """
 
     y: FloatArray
     status: StatusArray
     tangent: FloatArray
     event: str = ""
     bus: int = -1
+    switched: tuple[int, ...] = ()
 
 
 class _Event(NamedTuple):
@@ -141,7 +147,7 @@ class _Tracer:
                 nose, end, nose_bus = len(points), EndKind.LIMIT_INDUCED, reached.bus
                 nose_tangent = arriving
             moved = np.abs(reached.y - point.y)[: 2 * self.n].max()
-            stalls = stalls + 1 if moved < 1e-12 else 0
+            stalls = stalls + 1 if moved < _SAME else 0
             if stalls > 2 * self.n:
                 raise NotConverged(self._stuck(point))
             step = self._next_step(step, point, reached)
@@ -313,6 +319,9 @@ class _Tracer:
             along = (self.weight * point.tangent) @ np.stack([located - point.y, y - point.y]).T
             if not -1e-9 <= along[0] <= along[1] + 1e-9:
                 return None
+            if bus in point.switched and along[0] <= 1e-9:
+                # It left its limit here and comes back within the step: a shorter one tells where.
+                return None
             after, target_there = self._excess(located, point.status)
             after[bus] = -np.inf
             if not (after > _MARGIN).any():
@@ -342,7 +351,9 @@ class _Tracer:
             change = tangent[n + bus]
             wrong = change > 0 if event.status == UPPER else change < 0
         tangent = -tangent if wrong else tangent
-        return _Point(event.y, status, tangent, switching(grid, bus, event.status), bus)
+        still = np.abs(event.y - point.y)[: 2 * n].max() < _SAME
+        switched = (*(point.switched if still else ()), bus)
+        return _Point(event.y, status, tangent, switching(grid, bus, event.status), bus, switched)
 
     # --------------------------------------------------------------------------------- nose
 
