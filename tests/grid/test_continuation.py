@@ -89,6 +89,62 @@ def test_reactive_limits_end_it_where_bisection_with_the_same_limits_ends(grid: 
     assert (curve.status[curve.nose] == UPPER).any()
 
 
+def random_loading(network: Network, rng: np.random.Generator) -> Loading:
+    """A few loads that change, some of them down, and a few generators that rise."""
+    names, size = network.buses.name, network.n_bus
+    loads = rng.choice(size, rng.integers(1, 8), replace=False)
+    sources = np.flatnonzero(network.buses.kind != BusKind.PQ)
+    rising = rng.choice(sources, rng.integers(0, 4), replace=False)
+    return Loading(
+        "random",
+        p_gen_mw={names[k]: float(rng.uniform(0, 1)) for k in rising},
+        p_load_mw={names[k]: float(rng.uniform(-0.3, 1)) for k in loads},
+        q_load_mvar={names[k]: float(rng.uniform(-0.2, 0.6)) for k in loads},
+        balance={names[network.slack]: 1.0},
+    )
+
+
+@pytest.mark.parametrize("grid", ["ieee14", "ieee57"])
+@pytest.mark.parametrize("seed", range(8))
+def test_along_any_loading_power_flow_converges_below_the_limit_and_not_above(
+    grid: str, seed: int
+) -> None:
+    network = library.load(grid)
+    loading = random_loading(network, np.random.default_rng([seed, 13]))
+    d, limit = loading.direction(network), continuation(network, loading).limit
+
+    def solvable(factor: float) -> bool:
+        p = network.p_nominal_pu + factor * d.p_pu
+        q = network.q_nominal_pu - factor * d.q_load_pu
+        try:
+            solve(network, p, q, enforce_q_limits=True)
+        except NotConverged:
+            return False
+        return True
+
+    assert solvable(0.998 * limit)
+    assert not solvable(1.002 * limit)
+
+
+def test_generator_that_returns_from_its_limit_within_a_step_does_not_end_the_curve() -> None:
+    # Bus 3 comes to its lower limit, and its voltage falls back at once, far below the nose.
+    network = library.load("ieee57")
+    loading = Loading(
+        "relief",
+        p_load_mw={"43": -0.291, "23": 0.024},
+        q_load_mvar={"43": 0.051, "23": -0.05},
+        balance={"1": 1.0},
+    )
+    curve = continuation(network, loading)
+    touched = curve.event.index("bus 3 at its lower reactive limit")
+    assert "bus 3 holds its voltage again" in curve.event[touched:]
+    assert curve.limit > 1.5 * curve.loading[touched]
+    d = loading.direction(network)
+    p = network.p_nominal_pu + 0.99 * curve.limit * d.p_pu
+    q = network.q_nominal_pu - 0.99 * curve.limit * d.q_load_pu
+    assert not solve(network, p, q, enforce_q_limits=True).limited[network.bus("3")]
+
+
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     r=st.floats(0.0, 0.1), x=st.floats(0.05, 0.5), p=st.floats(1.0, 60.0), q=st.floats(-10.0, 30.0)

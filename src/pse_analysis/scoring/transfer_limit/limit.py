@@ -3,86 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pse_analysis.arrays import BoolArray, FloatArray
-from pse_analysis.errors import GridError, NotConverged, ParameterError, TableError
-from pse_analysis.grid.continuation import Curve, LoadedGrid, Loading, trace
+from pse_analysis.errors import ParameterError, TableError
+from pse_analysis.grid.continuation import Loading
 from pse_analysis.grid.continuation.base import BaseState
 from pse_analysis.grid.network import Network
-from pse_analysis.scoring.transfer_limit.constraints import Constraint, HighCurrent
-from pse_analysis.scoring.transfer_limit.outages import (
-    Outage,
-    Reached,
-    Setting,
-    Task,
-    curve_points,
-    described,
-    largest_power,
-    safely_traced,
-    study_outage,
-    where,
-)
-from pse_analysis.scoring.transfer_limit.params import (
-    Contingency,
-    Criterion,
-    TransferLimitParams,
-)
-from pse_analysis.scoring.transfer_limit.sections import Section, SectionPower
+from pse_analysis.scoring.transfer_limit.intact import IntactGrid
+from pse_analysis.scoring.transfer_limit.outages import Outage, Setting, Task, study_outage
+from pse_analysis.scoring.transfer_limit.params import Contingency, TransferLimitParams
+from pse_analysis.scoring.transfer_limit.result import Row, TransferLimit, result
+from pse_analysis.scoring.transfer_limit.sections import Section
 
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
 """Calls a function with each of several tasks, such as the built-in ``map``, in any order."""
-
-
-@dataclass(frozen=True, eq=False)
-class TransferLimit:
-    """The maximum allowed power flow of a section, and what it rests on.
-
-    Attributes
-    ----------
-    section : str
-    mapf_mw : float
-        The lowest value of all criteria, outages and loading vectors; NaN where one of them could
-        not be determined. [MW]
-    sigma_mw : float
-        Its standard error from the covariance of the base state, by the delta method; NaN without
-        one. [MW]
-    criterion, contingency, loading, element : str
-        Which of them binds, and what meets it first; the contingency is "" without outage.
-    base_mw : float
-        Power in the base state. [MW]
-    irregular_mw : float
-        Irregular oscillations ΔP. [MW]
-    table : DataFrame
-        One row per loading vector, contingency and criterion: ``state`` (found, not_reached,
-        unresolved), ``power_mw`` before and ``value_mw`` after margins, ``sigma_mw``,
-        ``loading_factor`` λ, ``element``, ``binding``, ``detail``.
-    curves : DataFrame
-        Nose curves, one row per point.
-    gradient : (2N,) ndarray
-        Derivative of the limit by the base state [θ; |V|]; zeros without a covariance.
-        [MW/rad, MW/p.u.]
-    findings : tuple of str
-        What a reader should know of, in sentences.
-    """
-
-    section: str
-    mapf_mw: float
-    sigma_mw: float
-    criterion: str
-    contingency: str
-    loading: str
-    element: str
-    base_mw: float
-    irregular_mw: float
-    table: pd.DataFrame
-    curves: pd.DataFrame
-    gradient: FloatArray
-    findings: tuple[str, ...]
 
 
 def transfer_limit(
@@ -162,185 +100,26 @@ def transfer_limit(
         )
         for loading in loadings
     ]
-    studies = {setting.loading: _Intact(setting) for setting in settings}
+    studies = [IntactGrid(setting) for setting in settings]
     tasks = [
-        Task(study.setting, outage, study.curve.limit)
-        for study in studies.values()
-        for outage in outages
+        Task(study.setting, outage, study.curve.limit) for study in studies for outage in outages
     ]
+    done: dict[tuple[str, str], Outage] = {}
     for number, found in enumerate(run(study_outage, tasks), start=1):
-        studies[found.loading].add(found)
+        done[found.loading, found.contingency] = found
         if progress is not None:
             progress(number, len(tasks))
+    rows: list[Row] = []
+    points = []
+    for study in studies:
+        # In the order in which they were asked for, whichever came first.
+        for outage in outages:
+            study.add(done[study.setting.loading, outage.name])
+        rows += [(study.setting.loading, name, reached) for name, reached in study.rows]
+        points += study.points
+    curves = pd.concat(points, ignore_index=True)
     irregular = _irregular(network, sending, params)
-    return _result(network, section, studies, base, irregular, covariance)
-
-
-class _Intact:
-    """The grid without outage under one loading vector, and what its outages allow."""
-
-    def __init__(self, setting: Setting) -> None:
-        self.setting = setting
-        network, params = setting.network, setting.params
-        self.power = SectionPower(network, setting.section)
-        self.grid = LoadedGrid(network, setting.base, setting.direction)
-        self.curve = trace(self.grid, params.continuation)
-        self._check_rise()
-        self.scale = self.curve.limit
-        self.curve, constraints = safely_traced(
-            self.grid, params.continuation, self._constraints, self.scale, self.curve
-        )
-        largest = largest_power(self.curve, self.power, gradients=setting.gradients)
-        if largest.power_mw <= 0:
-            raise GridError(
-                f"section {setting.section.name!r} carries {largest.power_mw:.4g} MW at the limit "
-                f"of loading {setting.loading!r}, against its direction: turn its signs, and the "
-                "loading with them"
-            )
-        self.rows = [("", _scaled(largest, params.power_share))]
-        for criterion, constraint in constraints.items():
-            met = where(self.curve, self.power, criterion, constraint, gradients=setting.gradients)
-            self.rows.append(("", met))
-        self.points = [curve_points(self.curve, self.power, setting, "")]
-
-    def _constraints(self, curve: Curve) -> dict[Criterion, Constraint]:
-        params = self.setting.params
-        found: dict[Criterion, Constraint] = {
-            Criterion.VOLTAGE: self.setting.low_voltage(curve.grid, params.voltage_share)
-        }
-        if params.continuous_ka:
-            found[Criterion.CURRENT] = HighCurrent(self.setting.network, params.continuous_ka)
-        return found
-
-    def _check_rise(self) -> None:
-        """Refuse a loading vector along which the section's power does not rise."""
-        curve, setting = self.curve, self.setting
-        power = self.power.power_mw(curve.x[:, : curve.nose + 1])
-        if power.max() - power[0] <= 1e-6 * self.power_scale:
-            raise GridError(
-                f"loading {setting.loading!r} does not raise the power of section "
-                f"{setting.section.name!r} ({power[0]:.4g} MW at first, {power[-1]:.4g} MW at the "
-                "limit): raise generation in the sending area and lower it, or raise load, in the "
-                "receiving one (Loading.transfer), or turn the section's signs"
-            )
-
-    @property
-    def power_scale(self) -> float:
-        """Base power. [MW]"""
-        return self.setting.network.base_mva
-
-    def add(self, outage: Outage) -> None:
-        """Take the criteria of an outage, as what flows in the grid without it."""
-        self.points.append(outage.points)
-        for reached in outage.reached:
-            self.rows.append((outage.contingency, self._before(reached)))
-
-    def _before(self, reached: Reached) -> Reached:
-        if reached.state != "found":
-            return reached
-        if reached.loading < self.curve.loading[0]:
-            start = reached.loading - 1e-6 * abs(self.scale)
-            try:
-                self.curve = trace(self.grid, self.setting.params.continuation, start=start)
-            except NotConverged as error:
-                return replace(reached, state="unresolved", detail=str(error), power_mw=np.nan)
-        located = self.curve.at(reached.loading)
-        if located is None:
-            detail = "the grid without outage reaches its limit first"
-            return replace(reached, state="not_reached", detail=detail, power_mw=np.nan)
-        if reached.loading_gradient is not None:
-            located = located.with_base_gradient(-reached.loading_gradient)
-        return described(
-            located,
-            self.power,
-            reached.criterion,
-            reached.element,
-            gradients=self.setting.gradients,
-        )
-
-
-def _scaled(reached: Reached, share: float) -> Reached:
-    by_power = reached.power_gradient
-    return replace(
-        reached,
-        power_mw=share * reached.power_mw,
-        power_gradient=None if by_power is None else share * by_power,
-    )
-
-
-def _result(
-    network: Network,
-    section: Section,
-    studies: dict[str, _Intact],
-    base: BaseState,
-    irregular: float,
-    covariance: FloatArray | None,
-) -> TransferLimit:
-    rows, gradients = [], []
-    for name, study in studies.items():
-        for contingency, reached in study.rows:
-            gradient = reached.power_gradient
-            variance = np.nan
-            if covariance is not None and gradient is not None:
-                variance = float(gradient @ covariance @ gradient)
-            gradients.append(gradient)
-            rows.append(
-                {
-                    "loading": name,
-                    "contingency": contingency,
-                    "criterion": str(reached.criterion),
-                    "state": reached.state,
-                    "value_mw": reached.power_mw - irregular,
-                    "sigma_mw": np.sqrt(max(variance, 0.0)) if variance == variance else np.nan,
-                    "power_mw": reached.power_mw,
-                    "loading_factor": reached.loading,
-                    "element": reached.element,
-                    "detail": reached.detail,
-                }
-            )
-    table = pd.DataFrame(rows)
-    found, open_ = table["state"] == "found", table["state"] == "unresolved"
-    best = int(table["value_mw"].where(found).idxmin())
-    table.insert(3, "binding", (table.index == best) & ~open_.any())
-    determined = not open_.any()
-    chosen = table.loc[best] if determined else None
-    gradient = gradients[best] if determined else None
-    power = SectionPower(network, section)
-    return TransferLimit(
-        section=section.name,
-        mapf_mw=float(chosen["value_mw"]) if chosen is not None else np.nan,
-        sigma_mw=float(chosen["sigma_mw"]) if chosen is not None else np.nan,
-        criterion=str(chosen["criterion"]) if chosen is not None else "",
-        contingency=str(chosen["contingency"]) if chosen is not None else "",
-        loading=str(chosen["loading"]) if chosen is not None else "",
-        element=str(chosen["element"]) if chosen is not None else "",
-        base_mw=float(power.power_mw(base.x)),
-        irregular_mw=irregular,
-        table=table.sort_values("value_mw", kind="stable", ignore_index=True),
-        curves=pd.concat([p for s in studies.values() for p in s.points], ignore_index=True),
-        gradient=np.zeros(2 * network.n_bus) if gradient is None else gradient,
-        findings=_findings(network, base, table),
-    )
-
-
-def _findings(network: Network, base: BaseState, table: pd.DataFrame) -> tuple[str, ...]:
-    out = []
-    open_ = table[table["state"] == "unresolved"]
-    for row in open_.itertuples():
-        after = f" after {row.contingency}" if row.contingency else ""
-        at = f" ({row.element})" if row.element else ""
-        out.append(
-            f"no limit is given, because {row.criterion}{after} along {row.loading}{at} is "
-            f"undetermined: {row.detail}"
-        )
-    beyond = np.flatnonzero(base.upper_is_base | base.lower_is_base)
-    if len(beyond):
-        names = ", ".join(network.buses.name[bus] for bus in beyond[:5])
-        out.append(
-            f"in the base state {len(beyond)} generators lie beyond their reactive limits and are "
-            f"held at what they give: buses {names}{', …' if len(beyond) > 5 else ''}"
-        )
-    return tuple(out)
+    return result(network, section, base, irregular, rows, curves, covariance)
 
 
 def _irregular(network: Network, sending: BoolArray, params: TransferLimitParams) -> float:

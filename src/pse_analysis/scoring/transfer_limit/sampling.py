@@ -12,8 +12,9 @@ from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import NotConverged, ParameterError
 from pse_analysis.grid.continuation import Loading
 from pse_analysis.grid.network import Network
-from pse_analysis.scoring.transfer_limit.limit import Run, TransferLimit, transfer_limit
+from pse_analysis.scoring.transfer_limit.limit import Run, transfer_limit
 from pse_analysis.scoring.transfer_limit.params import Contingency, TransferLimitParams
+from pse_analysis.scoring.transfer_limit.result import TransferLimit
 from pse_analysis.scoring.transfer_limit.sections import Section
 
 FAR = 8.0
