@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from reference import conventional
+from scipy import optimize
 
 from pse_analysis.errors import GridError, NotConverged, ParameterError, TableError
 from pse_analysis.estimation.static.wls import WeightedLeastSquares
@@ -321,6 +322,65 @@ def test_outage_that_cuts_off_a_generator_leaves_its_power_to_those_that_balance
     assert curve.limit > 0
 
 
+def three_buses() -> Network:
+    """A generator with a load behind a lossy line, tied to the slack bus."""
+    return Network.from_tables(
+        pd.DataFrame({"name": ["three"], "base_mva": [100.0]}),
+        pd.DataFrame(
+            {
+                "name": ["gen", "load", "rest"],
+                "kind": [2, 1, 3],
+                "vn_kv": [110.0] * 3,
+                "p_load_mw": [0.0, 50.0, 100.0],
+                "p_gen_mw": [150.0, 0.0, 0.0],
+            }
+        ),
+        pd.DataFrame(
+            {
+                "name": ["own", "tie"],
+                "from_bus": ["gen", "gen"],
+                "to_bus": ["load", "rest"],
+                "r_pu": [0.1, 0.01],
+                "x_pu": [0.2, 0.05],
+            }
+        ),
+    )
+
+
+OWN = Loading("own", p_gen_mw={"gen": 1.3}, p_load_mw={"load": 1.0}, balance={"rest": 1.0})
+
+
+def tie_power_mw(factor: float) -> float:
+    """Generation less load and loss of the own line, whose voltage solves a quadratic equation."""
+    p, r, x = 0.5 + factor / 100, 0.1, 0.2
+    # |V|⁴ + (2rP - 1)|V|² + (r² + x²)P² = 0 with 1 p.u. at the generator
+    b, c = 2 * r * p - 1.0, (r**2 + x**2) * p**2
+    square = 0.5 * (-b + np.sqrt(b**2 - 4 * c))
+    return float(150 + 1.3 * factor - 100 * (p + r * p**2 / square))
+
+
+def test_power_that_falls_before_the_nose_has_its_largest_value_there() -> None:
+    network = three_buses()
+    section = Section("tie", (BranchEnd("tie"),))
+    params = TransferLimitParams(irregular_mw=0.0, power_share=1.0)
+    x = solve(network).x
+    limit = transfer_limit(network, section, [OWN], params, state=x, covariance=np.eye(6))
+    best = optimize.minimize_scalar(
+        lambda f: -tie_power_mw(f), bounds=(0.0, 120.0), method="bounded", options={"xatol": 1e-9}
+    )
+    found = row(limit, "stability")
+    assert found["power_mw"] == pytest.approx(-best.fun, rel=1e-9)
+    assert found["loading_factor"] == pytest.approx(best.x, rel=1e-4)
+    assert found["element"] == "largest power"
+    nose = limit.curves["loading_factor"].max()
+    assert found["loading_factor"] < 0.99 * nose
+    step = 1e-5 * np.random.default_rng(SEED).standard_normal(6)
+    after, before = (
+        transfer_limit(network, section, [OWN], params, state=x + sign * step) for sign in (1, -1)
+    )
+    assert after.mapf_mw - before.mapf_mw == pytest.approx(2 * limit.gradient @ step, rel=1e-5)
+
+
 # --------------------------------------------------------------------------- standard error
 
 
@@ -370,6 +430,20 @@ def test_gradient_of_every_criterion_equals_finite_differences(params: TransferL
         change = limit.gradient @ (2 * step)
         assert after.mapf_mw - before.mapf_mw == pytest.approx(change, rel=1e-3)
     assert limit.sigma_mw == pytest.approx(np.sqrt(limit.gradient @ covariance @ limit.gradient))
+    # Angles count from anywhere.
+    angles = limit.gradient[: grid14().n_bus]
+    assert angles.sum() == pytest.approx(0.0, abs=1e-6 * np.abs(angles).max())
+
+
+def test_estimated_generation_beyond_a_reactive_limit_is_kept_and_told() -> None:
+    x = solve(grid14()).x.copy()
+    bus = grid14().bus("8")
+    x[grid14().n_bus + bus] += 0.06  # some 30 Mvar more, of 24 that it may give
+    limit = transfer_limit(grid14(), section14(), [plain()], state=x)
+    (finding,) = limit.findings
+    assert finding.startswith("in the base state 1 generators lie beyond their reactive limits")
+    assert "buses 8" in finding
+    assert np.isfinite(limit.mapf_mw)
 
 
 def test_predicted_sigma_agrees_with_estimates_of_noisy_meters() -> None:
