@@ -21,6 +21,8 @@ _LEAST_STEP = 1e-9
 """Step below which a curve counts as stuck, in units of the largest."""
 _SAME = 1e-9
 """Change of a state that is no move along the curve. [rad, p.u.]"""
+_AHEAD = 1e-5
+"""Change of a state that shows whether a curve goes on. [rad, p.u.]"""
 _FOLD = 1e-9
 """dλ/ds at a nose, in units of the first one."""
 
@@ -136,7 +138,8 @@ class _Tracer:
                 if step < _LEAST_STEP * self.params.largest_step:
                     if nose >= 0:  # what lies past the nose is only for show
                         return self._curve(points, nose, end, nose_bus, nose_tangent)
-                    raise NotConverged(self._stuck(point))
+                    point = self._passed(points, point, point.tangent)
+                    step = self.params.first_step
                 continue
             reached, arriving = found
             if nose < 0 and arriving[-1] < 0:
@@ -144,15 +147,19 @@ class _Tracer:
                 points.append(fold)
                 nose, nose_tangent = len(points) - 1, fold.tangent
             elif nose < 0 and reached.tangent[-1] < 0:
+                if (further := self._further(reached, arriving)) is not None:
+                    points += [reached._replace(status=further.status), further]
+                    point = further
+                    continue
                 nose, end, nose_bus = len(points), EndKind.LIMIT_INDUCED, reached.bus
                 nose_tangent = arriving
             moved = np.abs(reached.y - point.y)[: 2 * self.n].max()
             stalls = stalls + 1 if moved < _SAME else 0
-            if stalls > 2 * self.n:
-                raise NotConverged(self._stuck(point))
             step = self._next_step(step, point, reached)
             points.append(reached)
             point = reached
+            if stalls > 2 * self.n and nose < 0:
+                point, stalls = self._passed(points, point, arriving), 0
         raise NotConverged(
             f"{self.grid.network.name}: no limit within {len(points)} points up to λ = "
             f"{point.y[-1]:g}: the loading may relieve the grid, so turn its sign; or raise "
@@ -178,35 +185,83 @@ class _Tracer:
             tolerance=self.params.tolerance,
         )
 
-    def _stuck(self, point: _Point) -> str:
-        return (
-            f"{self.grid.network.name}: the curve could not be followed beyond λ = "
-            f"{point.y[-1]:g}: lower largest_step, or trace without reactive limits to see which "
-            "generator is in the way"
-        )
-
     def _first(self, start: float) -> _Point:
         """Returns the state at the loading to start from, and the direction of rising λ."""
-        grid, n = self.grid, self.n
+        grid = self.grid
         y = np.concatenate([grid.base.x, [0.0, start]])
-        status = grid.status.copy()
-        for _ in range(2 * n + 1):
-            found = grid.solve(
-                y, status, coordinate(2 * n + 1, start), tolerance=self.params.tolerance,
-                max_iterations=30, halvings=10,
-            )  # fmt: skip
-            if found is None:
-                break
-            y = found
-            beyond = self._beyond(y, status)
-            if not beyond:
-                return self._oriented_start(y, status)
-            for bus, new in beyond.items():
-                status[bus] = new
-        raise NotConverged(
-            f"{grid.network.name}: no state at λ = {start:g}: the grid cannot carry that load; "
-            "start from a lower λ"
-        )
+        found = self._settled(y, grid.status, start)
+        if found is None:
+            raise NotConverged(
+                f"{grid.network.name}: no state at λ = {start:g}: the grid cannot carry that load; "
+                "start from a lower λ"
+            )
+        return self._oriented_start(*found)
+
+    def _settled(
+        self, y: FloatArray, status: StatusArray, loading: float
+    ) -> tuple[FloatArray, StatusArray] | None:
+        """Returns the state at a loading, with what each generator holds there.
+
+        All that are beyond their limits change together, and where that leads nowhere, one at a
+        time, the furthest first.
+        """
+        condition = coordinate(2 * self.n + 1, loading)
+        for together in (True, False):
+            moved, held = y, status.copy()
+            for _ in range(2 * self.n + 1):
+                found = self.grid.solve(
+                    moved, held, condition, tolerance=self.params.tolerance,
+                    max_iterations=30, halvings=10,
+                )  # fmt: skip
+                if found is None:
+                    break
+                moved = found
+                excess, target = self._excess(moved, held)
+                beyond = excess > _MARGIN
+                if not beyond.any():
+                    return moved, held
+                if not together:
+                    beyond &= np.arange(self.n) == np.argmax(excess)
+                held[beyond] = target[beyond]
+        return None
+
+    def _further(self, point: _Point, arriving: FloatArray) -> _Point | None:
+        """Returns a state a little further along λ; None if the curve really turns back here.
+
+        Where several generators stand at their limits at once, as they may in an estimate, the one
+        that changes first does not tell where the curve goes.
+        """
+        n2 = 2 * self.n
+        ahead = point.y + _AHEAD / np.abs(arriving[:n2]).max() * arriving
+        found = self._settled(ahead, point.status, float(ahead[-1]))
+        if found is None or np.abs(found[0] - point.y)[:n2].max() > 20.0 * _AHEAD:
+            return None
+        y, status = found
+        along = np.zeros(len(y))
+        along[-1] = 1.0
+        tangent = self.grid.tangent(y, status, along)
+        if tangent is None:
+            return None
+        return _Point(y, status, self._normed(tangent))
+
+    def _passed(self, points: list[_Point], point: _Point, arriving: FloatArray) -> _Point:
+        """Adds a state a little further along λ than one at which the curve is stuck.
+
+        Raises
+        ------
+        NotConverged
+            If there is none.
+        """
+        further = self._further(point, arriving) if arriving[-1] > 0 else None
+        if further is None:
+            raise NotConverged(
+                f"{self.grid.network.name}: the curve could not be followed beyond λ = "
+                f"{point.y[-1]:g}: lower largest_step, or trace without reactive limits to see "
+                "which generator is in the way"
+            )
+        points[-1] = point._replace(status=further.status)
+        points.append(further)
+        return further
 
     def _oriented_start(self, y: FloatArray, status: StatusArray) -> _Point:
         grid, n2 = self.grid, 2 * self.n
@@ -290,10 +345,6 @@ class _Tracer:
         )
         target = np.where(held, np.where(to_upper < to_lower, UPPER, LOWER), VOLTAGE)
         return np.where(grid.controlled, excess, -np.inf), target
-
-    def _beyond(self, y: FloatArray, status: StatusArray) -> dict[int, int]:
-        excess, target = self._excess(y, status)
-        return {int(i): int(target[i]) for i in np.flatnonzero(excess > _MARGIN)}
 
     def _first_event(self, point: _Point, y: FloatArray) -> _Event | None:
         """Returns where before y the first generator changes what it holds; None if not found."""
