@@ -6,17 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pse_analysis.arrays import FloatArray, IntArray
+from pse_analysis.arrays import FloatArray
 from pse_analysis.errors import GridError, NotConverged
-from pse_analysis.grid.continuation.base import LOWER, UPPER, VOLTAGE, BaseState, StatusArray
+from pse_analysis.grid.continuation.base import UPPER, VOLTAGE, BaseState, StatusArray
 from pse_analysis.grid.continuation.curve import Curve, EndKind, switching
 from pse_analysis.grid.continuation.equations import LoadedGrid, coordinate, distance
 from pse_analysis.grid.continuation.loading import Loading
 from pse_analysis.grid.continuation.params import ContinuationParams
+from pse_analysis.grid.continuation.reactive_limits import MARGIN, excess, settled
 from pse_analysis.grid.network import Network
 
-_MARGIN = 1e-8
-"""How far beyond a limit a bus counts as beyond it. [p.u.]"""
 _LEAST_STEP = 1e-9
 """Step below which a curve counts as stuck, in units of the largest."""
 _SAME = 1e-9
@@ -189,41 +188,13 @@ class _Tracer:
         """Returns the state at the loading to start from, and the direction of rising λ."""
         grid = self.grid
         y = np.concatenate([grid.base.x, [0.0, start]])
-        found = self._settled(y, grid.status, start)
+        found = settled(grid, y, grid.status, start, self.params.tolerance)
         if found is None:
             raise NotConverged(
                 f"{grid.network.name}: no state at λ = {start:g}: the grid cannot carry that load; "
                 "start from a lower λ"
             )
         return self._oriented_start(*found)
-
-    def _settled(
-        self, y: FloatArray, status: StatusArray, loading: float
-    ) -> tuple[FloatArray, StatusArray] | None:
-        """Returns the state at a loading, with what each generator holds there.
-
-        All that are beyond their limits change together, and where that leads nowhere, one at a
-        time, the furthest first.
-        """
-        condition = coordinate(2 * self.n + 1, loading)
-        for together in (True, False):
-            moved, held = y, status.copy()
-            for _ in range(2 * self.n + 1):
-                found = self.grid.solve(
-                    moved, held, condition, tolerance=self.params.tolerance,
-                    max_iterations=30, halvings=10,
-                )  # fmt: skip
-                if found is None:
-                    break
-                moved = found
-                excess, target = self._excess(moved, held)
-                beyond = excess > _MARGIN
-                if not beyond.any():
-                    return moved, held
-                if not together:
-                    beyond &= np.arange(self.n) == np.argmax(excess)
-                held[beyond] = target[beyond]
-        return None
 
     def _further(self, point: _Point, arriving: FloatArray) -> _Point | None:
         """Returns a state a little further along λ; None if the curve really turns back here.
@@ -233,7 +204,7 @@ class _Tracer:
         """
         n2 = 2 * self.n
         ahead = point.y + _AHEAD / np.abs(arriving[:n2]).max() * arriving
-        found = self._settled(ahead, point.status, float(ahead[-1]))
+        found = settled(self.grid, ahead, point.status, float(ahead[-1]), self.params.tolerance)
         if found is None or np.abs(found[0] - point.y)[:n2].max() > 20.0 * _AHEAD:
             return None
         y, status = found
@@ -299,7 +270,7 @@ class _Tracer:
         if y is None or not np.abs(y - point.y)[:n2].max() < 2.0 * step:
             return None
         event = None
-        if (self._excess(y, point.status)[0] > _MARGIN).any():
+        if (excess(self.grid, y, point.status)[0] > MARGIN).any():
             event = self._first_event(point, y)
             if event is None:
                 return None
@@ -332,26 +303,12 @@ class _Tracer:
 
     # ------------------------------------------------------------------------------- events
 
-    def _excess(self, y: FloatArray, status: StatusArray) -> tuple[FloatArray, IntArray]:
-        """Returns by how much each generator is beyond what it holds, and what it should hold."""
-        grid = self.grid
-        to_upper, to_lower = grid.q_margin(y)
-        rise = y[self.n : 2 * self.n] - grid.base.vm_set
-        held = status == VOLTAGE
-        excess = np.select(
-            [held, status == UPPER, status == LOWER],
-            [np.maximum(-to_upper, -to_lower), rise, -rise],
-            -np.inf,
-        )
-        target = np.where(held, np.where(to_upper < to_lower, UPPER, LOWER), VOLTAGE)
-        return np.where(grid.controlled, excess, -np.inf), target
-
     def _first_event(self, point: _Point, y: FloatArray) -> _Event | None:
         """Returns where before y the first generator changes what it holds; None if not found."""
-        before, target = self._excess(point.y, point.status)
-        after, target = self._excess(y, point.status)
+        before, target = excess(self.grid, point.y, point.status)
+        after, target = excess(self.grid, y, point.status)
         for _ in range(self.n):
-            beyond = np.flatnonzero(after > _MARGIN)
+            beyond = np.flatnonzero(after > MARGIN)
             room = np.maximum(-before[beyond], 0.0)
             fraction = room / (room + after[beyond])
             first = int(np.argmin(fraction))
@@ -373,9 +330,9 @@ class _Tracer:
             if bus in point.switched and along[0] <= 1e-9:
                 # It left its limit here and comes back within the step: a shorter one tells where.
                 return None
-            after, target_there = self._excess(located, point.status)
+            after, target_there = excess(self.grid, located, point.status)
             after[bus] = -np.inf
-            if not (after > _MARGIN).any():
+            if not (after > MARGIN).any():
                 return _Event(located, bus, int(target[bus]))
             y, target = located, target_there
         return None
