@@ -104,8 +104,9 @@ def random_loading(network: Network, rng: np.random.Generator) -> Loading:
     )
 
 
-@pytest.mark.parametrize("grid", ["ieee14", "ieee57"])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(
+    ("grid", "seed"), [*(("ieee14", seed) for seed in range(8)), ("ieee57", 0), ("ieee57", 1)]
+)
 def test_along_any_loading_power_flow_converges_below_the_limit_and_not_above(
     grid: str, seed: int
 ) -> None:

@@ -17,7 +17,13 @@ from scipy import optimize
 from pse_analysis.errors import GridError, NotConverged, ParameterError, TableError
 from pse_analysis.estimation.static.wls import WeightedLeastSquares
 from pse_analysis.grid import Network, library
-from pse_analysis.grid.continuation import ContinuationParams, LoadedGrid, Loading, trace
+from pse_analysis.grid.continuation import (
+    ContinuationParams,
+    LoadedGrid,
+    Loading,
+    continuation,
+    trace,
+)
 from pse_analysis.grid.continuation.base import BaseState
 from pse_analysis.grid.power_flow import PowerFlow, solve
 from pse_analysis.pipeline.processes import each
@@ -465,6 +471,24 @@ def test_predicted_sigma_agrees_with_estimates_of_noisy_meters() -> None:
     assert sampled.sigma_mw == pytest.approx(limit.sigma_mw, rel=0.15)
     assert sampled.mean_mw == pytest.approx(limit.mapf_mw, abs=3 * spread / np.sqrt(200))
     assert sampled.undetermined == 0
+
+
+def test_estimates_with_several_generators_at_limits_have_one_limit_within_noise() -> None:
+    # In draws 119 and 235 three stand at their limit and set-point at once, where the first change
+    # alone does not tell where the curve goes.
+    network = library.load("ieee118")
+    layout = conventional(network)
+    x = solve(network, enforce_q_limits=True).x
+    estimator = WeightedLeastSquares(network, layout)
+    sigma = np.full(len(layout), 0.01)
+    covariance = estimator.solve(estimator.model.h(x), sigma, start=x).covariance()
+    size, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root = vectors * np.sqrt(np.maximum(size, 0.0))
+    rng = np.random.default_rng(5)
+    states = [x + root @ rng.standard_normal(len(x)) for _ in range(250)]
+    loading = Loading.transfer(network, "p", WEST, ["33", "35", "37"], by_load=True)
+    limits = [continuation(network, loading, state=states[k]).limit for k in (0, 119, 235)]
+    assert limits == pytest.approx([limits[0]] * 3, abs=10.0)
 
 
 def test_sampling_sees_criteria_change_places() -> None:

@@ -38,7 +38,13 @@ def excess(grid: LoadedGrid, y: FloatArray, status: StatusArray) -> tuple[FloatA
 
 
 def settled(
-    grid: LoadedGrid, y: FloatArray, status: StatusArray, loading: float, tolerance: float
+    grid: LoadedGrid,
+    y: FloatArray,
+    status: StatusArray,
+    loading: float,
+    tolerance: float,
+    *,
+    near: bool = False,
 ) -> tuple[FloatArray, StatusArray] | None:
     """Returns the state at a loading, with what each generator holds there.
 
@@ -54,13 +60,21 @@ def settled(
         λ.
     tolerance : float
         Largest mismatch. [p.u.]
+    near : bool
+        The state must lie so near that a few full Newton steps and changes lead to it.
     """
+    passes, iterations, halvings = (20, 5, 0) if near else (2 * grid.n + 1, 30, 10)
     condition = coordinate(2 * grid.n + 1, loading)
     for together in (True, False):
         moved, held = y, status.copy()
-        for _ in range(2 * grid.n + 1):
+        for _ in range(passes):
             found = grid.solve(
-                moved, held, condition, tolerance=tolerance, max_iterations=30, halvings=10
+                moved,
+                held,
+                condition,
+                tolerance=tolerance,
+                max_iterations=iterations,
+                halvings=halvings,
             )
             if found is None:
                 break
