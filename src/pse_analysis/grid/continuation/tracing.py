@@ -204,7 +204,9 @@ class _Tracer:
         """
         n2 = 2 * self.n
         ahead = point.y + _AHEAD / np.abs(arriving[:n2]).max() * arriving
-        found = settled(self.grid, ahead, point.status, float(ahead[-1]), self.params.tolerance)
+        found = settled(
+            self.grid, ahead, point.status, float(ahead[-1]), self.params.tolerance, near=True
+        )
         if found is None or np.abs(found[0] - point.y)[:n2].max() > 20.0 * _AHEAD:
             return None
         y, status = found
