@@ -489,6 +489,16 @@ def test_estimates_with_several_generators_at_limits_have_one_limit_within_noise
     loading = Loading.transfer(network, "p", WEST, ["33", "35", "37"], by_load=True)
     limits = [continuation(network, loading, state=states[k]).limit for k in (0, 119, 235)]
     assert limits == pytest.approx([limits[0]] * 3, abs=10.0)
+    # Their sensitivities hold too, with generators held at what the estimate shows beyond a limit.
+    section = Section.around(network, "west", WEST)
+    found = transfer_limit(network, section, [loading], state=states[0], covariance=covariance)
+    assert "3 generators lie beyond" in found.findings[0]
+    step = 3e-6 * np.random.default_rng(SEED).standard_normal(len(x))
+    after, before = (
+        transfer_limit(network, section, [loading], state=states[0] + sign * step)
+        for sign in (1, -1)
+    )
+    assert after.mapf_mw - before.mapf_mw == pytest.approx(2 * found.gradient @ step, rel=1e-4)
 
 
 def test_sampling_sees_criteria_change_places() -> None:

@@ -98,26 +98,7 @@ def solve(
     """
     if not own_references:
         _require_one_island(network)
-    given = [
-        np.asarray(default if value is None else value, dtype=float)
-        for value, default in (
-            (p_pu, network.p_nominal_pu),
-            (q_pu, network.q_nominal_pu),
-            (vm_set_pu, network.buses.vm_set_pu),
-        )
-    ]
-    points = max((g.shape[1] if g.ndim == 2 else 0 for g in given), default=0)
-    p, q, vm_set = (
-        np.broadcast_to(g if g.ndim == 2 else g[:, None], (network.n_bus, max(points, 1)))
-        for g in given
-    )
-    for name, values in (("p_pu", p), ("q_pu", q), ("vm_set_pu", vm_set)):
-        if not np.isfinite(values).all():
-            bus, state = np.argwhere(~np.isfinite(values))[0]
-            raise GridError(
-                f"power flow: {name} must be finite, received {values[bus, state]} at bus "
-                f"{network.buses.name[bus]!r}, state {state}"
-            )
+    p, q, vm_set, points = _given(network, p_pu, q_pu, vm_set_pu)
     cold = (
         None
         if start is None
@@ -144,6 +125,36 @@ def solve(
         iterations=iterations,
         limited=(~np.isnan(limit)).reshape(shape),
     )
+
+
+def _given(
+    network: Network,
+    p_pu: FloatArray | None,
+    q_pu: FloatArray | None,
+    vm_set_pu: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """Returns injections and set-points as (n_bus, n_state), and n_state, 0 for a single state."""
+    given = [
+        np.asarray(default if value is None else value, dtype=float)
+        for value, default in (
+            (p_pu, network.p_nominal_pu),
+            (q_pu, network.q_nominal_pu),
+            (vm_set_pu, network.buses.vm_set_pu),
+        )
+    ]
+    points = max((g.shape[1] if g.ndim == 2 else 0 for g in given), default=0)
+    p, q, vm_set = (
+        np.broadcast_to(g if g.ndim == 2 else g[:, None], (network.n_bus, max(points, 1)))
+        for g in given
+    )
+    for name, values in (("p_pu", p), ("q_pu", q), ("vm_set_pu", vm_set)):
+        if not np.isfinite(values).all():
+            bus, state = np.argwhere(~np.isfinite(values))[0]
+            raise GridError(
+                f"power flow: {name} must be finite, received {values[bus, state]} at bus "
+                f"{network.buses.name[bus]!r}, state {state}"
+            )
+    return p, q, vm_set, points
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,8 +121,6 @@ class _Tracer:
         self.weight = np.zeros(2 * self.n + 2)
         self.weight[: 2 * self.n] = 1.0
 
-    # ------------------------------------------------------------------------------- course
-
     def run(self, start: float) -> Curve:
         point = self._first(start)
         points, nose, end, nose_bus = [point], -1, EndKind.SADDLE_NODE, -1
@@ -147,7 +145,7 @@ class _Tracer:
                 nose, nose_tangent = len(points) - 1, fold.tangent
             elif nose < 0 and reached.tangent[-1] < 0:
                 if (further := self._further(reached, arriving)) is not None:
-                    points += [reached._replace(status=further.status), further]
+                    points += [_towards(reached, further), further]
                     point = further
                     continue
                 nose, end, nose_bus = len(points), EndKind.LIMIT_INDUCED, reached.bus
@@ -232,7 +230,7 @@ class _Tracer:
                 f"{point.y[-1]:g}: lower largest_step, or trace without reactive limits to see "
                 "which generator is in the way"
             )
-        points[-1] = point._replace(status=further.status)
+        points[-1] = _towards(point, further)
         points.append(further)
         return further
 
@@ -255,8 +253,6 @@ class _Tracer:
             )
         self.weight[-1] = size**2
         return _Point(y, status.copy(), self._normed(tangent))
-
-    # -------------------------------------------------------------------------------- steps
 
     def _normed(self, tangent: FloatArray) -> FloatArray:
         return np.asarray(tangent / np.sqrt(self.weight @ tangent**2))
@@ -302,8 +298,6 @@ class _Tracer:
         straight = float((self.weight * before.tangent) @ after.tangent)
         factor = 2.0 if straight > 0.995 else 1.3 if straight > 0.97 else 0.8
         return min(step * factor, self.params.largest_step)
-
-    # ------------------------------------------------------------------------------- events
 
     def _first_event(self, point: _Point, y: FloatArray) -> _Event | None:
         """Returns where before y the first generator changes what it holds; None if not found."""
@@ -365,8 +359,6 @@ class _Tracer:
         switched = (*(point.switched if still else ()), bus)
         return _Point(event.y, status, tangent, switching(grid, bus, event.status), bus, switched)
 
-    # --------------------------------------------------------------------------------- nose
-
     def _fold(self, point: _Point, beyond: FloatArray) -> _Point:
         """Returns the saddle node between a point before it and a state past it.
 
@@ -394,3 +386,8 @@ class _Tracer:
                 high, f_high, f_low = length, value, f_low * (0.5 if side < 0 else 1.0)
                 side = -1
         return best
+
+
+def _towards(point: _Point, further: _Point) -> _Point:
+    """Returns a point with what buses hold, and the direction of travel, towards a further one."""
+    return point._replace(status=further.status, tangent=further.tangent)

@@ -132,12 +132,17 @@ def sampled_limit(
         found.append(one)
         if progress is not None:
             progress(number, count)
+    return _summary(network.name, found)
+
+
+def _summary(grid: str, found: Sequence[tuple[float, str, str, str]]) -> SampledLimit:
+    """Mean, standard deviation and binding criteria of samples."""
     table = pd.DataFrame(found, columns=["value", "loading", "contingency", "criterion"])
     values = table["value"].to_numpy(dtype=float)
     known = np.isfinite(values)
     if known.sum() < 2:
         raise NotConverged(
-            f"{network.name}: {count - int(known.sum())} of {count} sampled states have no limit: "
+            f"{grid}: {int((~known).sum())} of {len(known)} sampled states have no limit: "
             "the base state is too uncertain, or too near to the limit itself"
         )
     key = ["loading", "contingency", "criterion"]
