@@ -592,6 +592,10 @@ def test_outage_that_no_loading_helps_leaves_no_limit_and_says_why(trip: str, re
     assert not limit.table["binding"].any()
     assert limit.criterion == limit.loading == ""
     assert re.search(reason, limit.findings[0])
+    least = limit.table["value_mw"].min()
+    assert limit.findings[-1].startswith(
+        f"the lowest of what could be determined is {least:.4g} MW"
+    )
     assert np.isfinite(row(limit, "stability")["value_mw"])
     assert np.isfinite(row(limit, "stability_after_outage", "2-4")["value_mw"])
 

@@ -90,9 +90,8 @@ class LoadedGrid:
 
     def q_given(self, status: StatusArray) -> FloatArray:
         """Returns the reactive injections that buses without voltage control have at λ = 0."""
-        base = self.base
-        limits = [base.upper, base.lower]
-        return np.asarray(np.select([status == UPPER, status == LOWER], limits, base.q_pu))
+        at_lower = np.where(status == LOWER, self.base.lower, self.base.q_pu)
+        return np.where(status == UPPER, self.base.upper, at_lower)
 
     def _solved(self, y: FloatArray, residual: FloatArray, tolerance: float) -> bool:
         """Returns whether residuals are as small as asked for, or as rounding allows."""
@@ -127,8 +126,11 @@ class LoadedGrid:
         ]
         rows, cols = (np.concatenate([b[k] for b in blocks]) for k in (0, 1))
         self._order = np.lexsort((rows, cols))
-        self._rows = rows[self._order].astype(np.int32)
-        self._starts = np.searchsorted(cols[self._order], np.arange(size + 1)).astype(np.int32)
+        starts = np.searchsorted(cols[self._order], np.arange(size + 1))
+        # One matrix whose entries are replaced: its pattern is checked once.
+        self._matrix = sparse.csc_array(
+            (np.zeros(len(rows)), rows[self._order], starts), shape=(size, size)
+        )
         own = (model.indices == model.row_of_entry) & (model.row_of_entry < n)
         self._own_angle = np.flatnonzero(own)
         own = (model.indices == model.row_of_entry) & (model.row_of_entry >= n)
@@ -155,7 +157,6 @@ class LoadedGrid:
             Of the condition.
         """
         n = self.n
-        size = 2 * n + 2
         unit_q = status == VOLTAGE
         d_q = np.where(unit_q, 0.0, self.d_q)
         data = np.concatenate(
@@ -170,9 +171,9 @@ class LoadedGrid:
         )
         if not np.isfinite(data).all():
             return None
-        matrix = sparse.csc_array((data[self._order], self._rows, self._starts), shape=(size, size))
+        self._matrix.data = data[self._order]
         try:
-            return sparse_linalg.splu(matrix)
+            return sparse_linalg.splu(self._matrix)
         except RuntimeError:  # exactly singular
             return None
 

@@ -123,15 +123,19 @@ def _sigma(gradient: FloatArray | None, covariance: FloatArray | None) -> float:
 
 
 def _findings(network: Network, base: BaseState, table: pd.DataFrame) -> tuple[str, ...]:
-    out = []
-    open_ = table[table["state"] == "unresolved"]
-    for row in open_.itertuples():
-        after = f" after {row.contingency}" if row.contingency else ""
-        at = f" ({row.element})" if row.element else ""
-        out.append(
-            f"no limit is given, because {row.criterion}{after} along {row.loading}{at} is "
-            f"undetermined: {row.detail}"
-        )
+    out = [
+        f"no limit is given, because {row.criterion}{_after(row)} along {row.loading}"
+        f"{f' ({row.element})' if row.element else ''} is undetermined: {row.detail}"
+        for row in table[table["state"] == "unresolved"].itertuples()
+    ]
+    found = table[table["state"] == "found"]
+    if out and len(found):
+        least = found.loc[[found["value_mw"].idxmin()]]
+        out += [
+            f"the lowest of what could be determined is {row.value_mw:.4g} MW, of "
+            f"{row.criterion}{_after(row)} along {row.loading}"
+            for row in least.itertuples()
+        ]
     beyond = np.flatnonzero(base.upper_is_base | base.lower_is_base)
     if len(beyond):
         names = ", ".join(network.buses.name[bus] for bus in beyond[:5])
@@ -140,3 +144,7 @@ def _findings(network: Network, base: BaseState, table: pd.DataFrame) -> tuple[s
             f"held at what they give: buses {names}{', …' if len(beyond) > 5 else ''}"
         )
     return tuple(out)
+
+
+def _after(row: Any) -> str:
+    return f" after {row.contingency}" if row.contingency else ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -113,9 +113,9 @@ class Section:
         at_from = np.array([(end.side == "from") == (end.sign > 0) for end in self.ends])
         sources = np.where(at_from, branch.from_bus[position], branch.to_bus[position])
         sinks = np.where(at_from, branch.to_bus[position], branch.from_bus[position])
-        rest = network
-        for name in names:
-            rest = rest.open_branch(name)
+        closed = branch.in_service.copy()
+        closed[position] = False
+        rest = replace(network, branches=replace(branch, in_service=closed))
         part = rest.islands()
         for source, sink, name in zip(sources, sinks, names, strict=True):
             if part[source] == part[sink]:
