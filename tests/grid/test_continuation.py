@@ -354,6 +354,16 @@ def test_loading_that_sums_to_nothing_is_refused_with_a_remedy() -> None:
         continuation(network, Loading("none", p_load_mw={"4": 0.0}))
 
 
+def test_numbers_and_buses_of_a_loading_are_checked() -> None:
+    network = library.load("ieee14")
+    with pytest.raises(GridError, match=r"ieee14 has no bus '144': did you mean 14"):
+        continuation(network, Loading("far", p_load_mw={"144": 1.0}))
+    with pytest.raises(GridError, match=r"p_load_mw must be finite, received nan at bus '4'"):
+        continuation(network, Loading("no", p_load_mw={"4": float("nan")}))
+    with pytest.raises(GridError, match=r"balance must not be negative, received -1 at bus '2'"):
+        continuation(network, Loading("no", p_load_mw={"4": 1.0}, balance={"2": -1.0}))
+
+
 def test_loading_that_only_the_slack_feels_is_refused() -> None:
     network = library.load("ieee14")
     loading = Loading("own", p_gen_mw={"1": 10.0}, balance={"1": 1.0})
