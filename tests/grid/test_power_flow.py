@@ -300,3 +300,32 @@ def test_a_phase_shifter_turns_what_lies_behind_it_and_nothing_else(degrees: flo
     np.testing.assert_allclose(found[1], plain[1], atol=1e-9)
     np.testing.assert_allclose(found[0, 0], 0.0, atol=1e-12)
     np.testing.assert_allclose(found[0, 1:], plain[0, 1:] - shift[0], atol=1e-9)
+
+
+def test_limits_are_tried_one_at_a_time_where_together_they_leave_no_solution() -> None:
+    # While all generators hold their voltages, 3 absorbs more than it may. At that limit, with 2, 6
+    # and 8 at theirs, nothing converges; but once these have given in, 3 has to generate.
+    network = library.load("ieee14")
+    p, q = network.p_nominal_pu.copy(), network.q_nominal_pu.copy()
+    for name, rise_mw in (("2", 282.0), ("3", 423.0), ("8", 94.0), ("5", -94.0)):
+        p[network.bus(name)] += rise_mw / network.base_mva
+    q[network.bus("5")] -= 188.0 / network.base_mva
+    flow = solve(network, p, q, enforce_q_limits=True)
+    pv = network.buses.kind == BusKind.PV
+    generation = (flow.q_pu - q) * network.base_mva
+    assert flow.limited.any()
+    assert (generation[pv] <= network.buses.q_max_mvar[pv] + 1e-6).all()
+    assert (generation[pv] >= network.buses.q_min_mvar[pv] - 1e-6).all()
+    full = np.abs(generation - network.buses.q_max_mvar) < 1e-6
+    assert (flow.vm <= network.buses.vm_set_pu + 1e-9)[flow.limited & full].all()
+    held = pv & ~flow.limited
+    np.testing.assert_array_equal(flow.vm[held], network.buses.vm_set_pu[held])
+    np.testing.assert_allclose(flow.p_pu[1:], p[1:], atol=1e-9)
+    # With one state that cannot be solved at all, the message is the usual one.
+    with pytest.raises(NotConverged, match="1 of 2 states are open"):
+        solve(
+            network,
+            np.stack([p, 20.0 * p], axis=1),
+            np.stack([q, 20.0 * q], axis=1),
+            enforce_q_limits=True,
+        )

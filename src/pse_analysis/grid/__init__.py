@@ -1,7 +1,7 @@
 """Grid models: buses, branches, admittance, and a small library of test grids.
 
-Power flow stands in `pse_analysis.grid.power_flow`; it uses the measurement model, so it comes
-after it.
+Power flow stands in `pse_analysis.grid.power_flow` and continuation power flow in
+`pse_analysis.grid.continuation`; they use the measurement model, so they come after it.
 """
 
 from __future__ import annotations

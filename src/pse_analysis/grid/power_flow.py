@@ -98,6 +98,42 @@ def solve(
     """
     if not own_references:
         _require_one_island(network)
+    p, q, vm_set, points = _given(network, p_pu, q_pu, vm_set_pu)
+    cold = (
+        None
+        if start is None
+        else np.broadcast_to(
+            start if np.ndim(start) == 2 else np.asarray(start)[:, None],
+            (2 * network.n_bus, p.shape[1]),
+        )
+    )
+    problem = _Problem(network, p, q, vm_set, cold, tolerance, max_iterations)
+    try:
+        x, limit, iterations = problem.solve(enforce_q_limits, one_at_a_time=False)
+    except NotConverged:
+        if not enforce_q_limits:
+            raise
+        # Generators that leave their limits together may leave no solution where the worst does.
+        x, limit, iterations = problem.solve(enforce_q_limits, one_at_a_time=True)
+    solved_p, solved_q = _injections(network, x)
+    shape = (network.n_bus, points) if points else (network.n_bus,)
+    return PowerFlow(
+        theta=x[: network.n_bus].reshape(shape),
+        vm=x[network.n_bus :].reshape(shape),
+        p_pu=solved_p.reshape(shape),
+        q_pu=solved_q.reshape(shape),
+        iterations=iterations,
+        limited=(~np.isnan(limit)).reshape(shape),
+    )
+
+
+def _given(
+    network: Network,
+    p_pu: FloatArray | None,
+    q_pu: FloatArray | None,
+    vm_set_pu: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """Returns injections and set-points as (n_bus, n_state), and n_state, 0 for a single state."""
     given = [
         np.asarray(default if value is None else value, dtype=float)
         for value, default in (
@@ -118,52 +154,69 @@ def solve(
                 f"power flow: {name} must be finite, received {values[bus, state]} at bus "
                 f"{network.buses.name[bus]!r}, state {state}"
             )
-    x = np.empty((2 * network.n_bus, p.shape[1]))
-    held = np.broadcast_to((network.buses.kind == BusKind.PV)[:, None], p.shape).copy()
-    limit = np.full(p.shape, np.nan)
-    iterations = 0
-    # Every pass solves the states whose set of voltage-controlled buses changed.
-    pending = np.arange(p.shape[1])
-    if start is not None:
-        x[:] = start if np.ndim(start) == 2 else np.asarray(start)[:, None]
-    for number in range(network.n_bus + 1):
-        for pattern, states in _groups(held, pending):
-            cold = number == 0 and start is None
-            starts = (
-                _starts(network, p, vm_set, max_iterations)
-                if cold
-                else [(lambda some: x[:, some], max_iterations)]
-            )
-            x[:, states], used = _solve_from(
-                NewtonPowerFlow(network, pattern, tolerance),
-                starts,
-                states,
-                p[:, states],
-                np.where(np.isnan(limit[:, states]), q[:, states], limit[:, states]),
-                vm_set[:, states],
-            )
-            iterations = max(iterations, used)
-        if not enforce_q_limits:
-            break
-        pending = _switch(network, x, q, vm_set, held, limit)
-        if not len(pending):
-            break
-    else:
+    return p, q, vm_set, points
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """States to be solved; arrays are (n_bus, n_state), ``start`` (2 n_bus, n_state) or None."""
+
+    network: Network
+    p: FloatArray
+    q: FloatArray
+    vm_set: FloatArray
+    start: FloatArray | None
+    tolerance: float
+    max_iterations: int
+
+    def solve(
+        self, enforce_q_limits: bool, one_at_a_time: bool
+    ) -> tuple[FloatArray, FloatArray, int]:
+        """Solve the states in passes, each for those whose set of voltage-controlled buses changed.
+
+        Returns
+        -------
+        x : (2 n_bus, n_state) ndarray
+        limit : (n_bus, n_state) ndarray
+            Reactive injection of buses at a limit; NaN elsewhere. [p.u.]
+        iterations : int
+        """
+        network, p, q, vm_set = self.network, self.p, self.q, self.vm_set
+        x = np.empty((2 * network.n_bus, p.shape[1]))
+        if self.start is not None:
+            x[:] = self.start
+        held = np.broadcast_to((network.buses.kind == BusKind.PV)[:, None], p.shape).copy()
+        limit = np.full(p.shape, np.nan)
+        iterations = 0
+        pending = np.arange(p.shape[1])
+        passes = (4 if one_at_a_time else 1) * network.n_bus + 1
+        for number in range(passes):
+            for pattern, states in _groups(held, pending):
+                cold = number == 0 and self.start is None
+                starts = (
+                    _starts(network, p, vm_set, self.max_iterations)
+                    if cold
+                    else [(lambda some: x[:, some], self.max_iterations)]
+                )
+                x[:, states], used = _solve_from(
+                    NewtonPowerFlow(network, pattern, self.tolerance),
+                    starts,
+                    states,
+                    p[:, states],
+                    np.where(np.isnan(limit[:, states]), q[:, states], limit[:, states]),
+                    vm_set[:, states],
+                )
+                iterations = max(iterations, used)
+            if not enforce_q_limits:
+                return x, limit, iterations
+            pending = _switch(network, x, q, vm_set, held, limit, one_at_a_time)
+            if not len(pending):
+                return x, limit, iterations
         raise NotConverged(
             f"power flow of {network.name}: the set of buses at a reactive limit still changed "
-            f"after {network.n_bus + 1} passes in {len(pending)} of {p.shape[1]} states: widen the "
+            f"after {passes} passes in {len(pending)} of {p.shape[1]} states: widen the "
             "limits or solve without them"
         )
-    solved_p, solved_q = _injections(network, x)
-    shape = (network.n_bus, points) if points else (network.n_bus,)
-    return PowerFlow(
-        theta=x[: network.n_bus].reshape(shape),
-        vm=x[network.n_bus :].reshape(shape),
-        p_pu=solved_p.reshape(shape),
-        q_pu=solved_q.reshape(shape),
-        iterations=iterations,
-        limited=(~np.isnan(limit)).reshape(shape),
-    )
 
 
 def _require_one_island(network: Network) -> None:
@@ -247,11 +300,13 @@ def _switch(
     vm_set: FloatArray,
     held: npt.NDArray[np.bool_],
     limit: FloatArray,
+    one_at_a_time: bool,
 ) -> npt.NDArray[np.int64]:
     """Turn PV buses beyond a limit into PQ, and back where the voltage allows; states that changed.
 
     A bus at its upper limit whose voltage exceeds the set-point (or at its lower limit with a
-    voltage below it) would need less than the limit, so it controls its voltage again.
+    voltage below it) would need less than the limit, so it controls its voltage again. One at a
+    time, the bus that is furthest beyond its limit or its voltage changes in each state.
     """
     _, q = _injections(network, x)
     controlled = (network.buses.kind == BusKind.PV)[:, None]
@@ -262,6 +317,11 @@ def _switch(
     over, under = held & (q > upper + margin), held & (q < lower - margin)
     released = controlled & ~held
     back = released & np.where(limit >= upper - margin, vm > vm_set + 1e-9, vm < vm_set - 1e-9)
+    if one_at_a_time:
+        excess = np.select([over, under, back], [q - upper, lower - q, np.abs(vm - vm_set)], 0.0)
+        worst = np.zeros_like(over)
+        worst[np.argmax(excess, axis=0), np.arange(excess.shape[1])] = True
+        over, under, back = over & worst, under & worst, back & worst
     limit[over], limit[under] = upper[over], lower[under]
     limit[back] = np.nan
     held[over | under] = False

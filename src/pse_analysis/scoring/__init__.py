@@ -1,9 +1,15 @@
-"""Scores: errors against truth, faults found, and whether a filter's σ means what it says."""
+"""Scores: errors against truth, faults found, and whether a filter's σ means what it says.
+
+How much power a section may carry stands in `pse_analysis.scoring.transfer_limit`, which no stage
+of a case needs, so that it is imported where it is asked for.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import ModuleType
 
 import pandas as pd
 
@@ -20,6 +26,13 @@ __all__ = [
     "observers",
     "score",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import the study of transfer limits on first use."""
+    if name == "transfer_limit":
+        return importlib.import_module("pse_analysis.scoring.transfer_limit")
+    raise AttributeError(f"module 'pse_analysis.scoring' has no attribute {name!r}")
 
 
 @dataclass(frozen=True)

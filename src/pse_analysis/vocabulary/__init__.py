@@ -22,6 +22,12 @@ trial           one realisation of load, noise and faults, drawn from its own se
 variant         a named way to run one stage (for example alignment with or without DTW)
 innovation      measurement minus its prediction, η
 NIS, NEES       normalised squared innovation ηᵀS⁻¹η and state error eᵀP⁻¹e
+section         branch ends, with signs, that together cut a grid in two areas
+loading vector  changes of generation and load that grow together, λ times
+contingency     branches that trip together; also *outage*
+nose            the largest λ that a grid carries: a saddle node, or limit-induced where a generator
+                reaches its reactive limit
+MAPF            maximum allowed power flow of a section: the lowest of six criteria
 """
 
 from __future__ import annotations
