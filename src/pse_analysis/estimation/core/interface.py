@@ -43,8 +43,6 @@ class Snapshot:
         Time since the sample was taken. [s]
     inputs : ndarray, optional
         Known inputs u of the model.
-    topology : str
-        Names the grid that was in service; "" is the base grid.
     """
 
     time: np.datetime64
@@ -55,7 +53,6 @@ class Snapshot:
     fresh: BoolArray
     age_s: FloatArray
     inputs: FloatArray | None = None
-    topology: str = ""
 
     def silent(self) -> Snapshot:
         """The same instant without any measurement."""
