@@ -138,7 +138,10 @@ def study_tables(n_instant: int = 288, n_trial: int = 2) -> StudyTables:
         channels=check("channels", channels),
         validated=validated,
         aligned=check("aligned", aligned),
-        estimated=check("estimated", pd.concat(estimates, ignore_index=True)),
+        estimated=check(
+            "estimated",
+            pd.concat(estimates, ignore_index=True).assign(relative=np.nan, sigma_relative=np.nan),
+        ),
         residuals=check("residuals", residuals),
         steps=check("steps", pd.concat(steps, ignore_index=True)),
         scored=check("scored", _scored(network, n_trial, rng)),

@@ -223,3 +223,24 @@ def test_variance_of_a_walk_is_found_from_innovations() -> None:
         frame = after.frame._replace(angle=0.0, sampled=np.zeros(len(layout())))
         found.append(after.variance)
     assert 0.5 < np.sqrt(np.median(found[50:])) / np.deg2rad(0.03) < 2.0
+
+
+@pytest.mark.parametrize("kind", ["kalman", "ukf"])
+def test_angles_relative_to_the_slack_do_not_follow_the_reference(kind: str) -> None:
+    """A reference that turns by 137° a step: relative angles have the truth within 3σ."""
+    x = truth(MOVES["degrees per second"])
+    tables = run(estimator(kind, UNKNOWN), iter(snapshots(measured(x))), NETWORK, layout())
+    angle = tables.estimated[tables.estimated["quantity"] == "va_degree"]
+    value, sigma, absolute = (
+        angle[column].to_numpy().reshape(STEPS, N)
+        for column in ("relative", "sigma_relative", "sigma")
+    )
+    slack = NETWORK.slack
+    assert (value[:, slack] == 0).all()
+    assert (sigma[:, slack] < 1e-9).all()
+    others = np.delete(np.arange(N), slack)
+    error = value - np.rad2deg(x[:N] - x[slack]).T
+    assert (np.abs(error) < 3 * sigma)[:, others].mean() > 0.97
+    assert np.median(sigma[:, others]) < np.median(absolute[:, others])
+    size = tables.estimated[tables.estimated["quantity"] == "vm_pu"]
+    assert size[["relative", "sigma_relative"]].isna().all(axis=None)

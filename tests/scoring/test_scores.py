@@ -25,13 +25,15 @@ def estimates(rows: list[tuple[str, int, str, str, float, float]]) -> pd.DataFra
         rows, columns=["method", "minute", "element", "quantity", "value", "sigma"]
     )
     frame["time_utc"] = at(frame["minute"])
-    return check("estimated", frame.assign(trial=np.int32(0)))
+    return check(
+        "estimated", frame.assign(trial=np.int32(0), relative=np.nan, sigma_relative=np.nan)
+    )
 
 
 def truths(rows: list[tuple[int, str, str, float]]) -> pd.DataFrame:
     frame = pd.DataFrame(rows, columns=["minute", "element", "quantity", "value"])
     frame["time_utc"] = at(frame["minute"])
-    return check("truth", frame.assign(trial=np.int32(0)))
+    return check("truth", frame.assign(trial=np.int32(0), relative=np.nan, sigma_relative=np.nan))
 
 
 def steps(rows: list[tuple[int, str, float, int, float]]) -> pd.DataFrame:

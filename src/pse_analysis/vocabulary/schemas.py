@@ -164,6 +164,8 @@ def schema(table: str) -> pa.DataFrameSchema:
             "quantity": text(one_of(Quantity)),
             "value": col("float64", nullable=True),
             "sigma": col("float64", nullable=True),
+            "relative": col("float64", nullable=True),
+            "sigma_relative": col("float64", nullable=True),
         },
         "residuals": {
             **step_key,

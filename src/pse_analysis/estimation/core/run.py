@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from pse_analysis.arrays import BoolArray, FloatArray
+from pse_analysis.arrays import BoolArray, FloatArray, IntArray
 from pse_analysis.errors import NotConverged, ParameterError, Unobservable
 from pse_analysis.estimation.core.interface import FAILURES, Estimate, Estimator, Info, Snapshot
 from pse_analysis.machine import STATES, Machine
@@ -66,12 +66,15 @@ class States:
         Reported value over the estimate's own.
     folded : (n,) ndarray of bool
         Angles that are known up to full turns.
+    reference : (n,) ndarray of int
+        Place of the angle that stands for the island of each angle; -1 where there is none.
     """
 
     element: npt.NDArray[np.object_]
     quantity: npt.NDArray[np.object_]
     factor: FloatArray
     folded: BoolArray
+    reference: IntArray
 
     def __len__(self) -> int:
         return len(self.factor)
@@ -85,6 +88,7 @@ class States:
                 np.array(STATES, dtype=object),
                 np.ones(len(STATES)),
                 np.zeros(len(STATES), dtype=bool),
+                np.full(len(STATES), -1),
             )
         n = model.n_bus
         return cls(
@@ -92,7 +96,18 @@ class States:
             np.array(["va_degree"] * n + ["vm_pu"] * n, dtype=object),
             np.concatenate([np.full(n, 180.0 / np.pi), np.ones(n)]),
             np.arange(2 * n) < n,
+            np.concatenate([model.references, np.full(n, -1)]),
         )
+
+    def relative(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+        """Angles less that of the reference of their island, and σ of it; NaN elsewhere. (n,)"""
+        value, sigma = np.full((2, len(self)), np.nan)
+        angle = np.flatnonzero(self.reference >= 0)
+        at, P = self.reference[angle], estimate.covariance
+        value[angle] = wrap(estimate.x[angle] - estimate.x[at])
+        variance = P[angle, angle] + P[at, at] - 2.0 * P[angle, at]
+        sigma[angle] = np.sqrt(np.maximum(variance, 0.0))
+        return value, sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +126,8 @@ class _Trace:
     time: list[np.datetime64] = field(default_factory=list)
     x: list[FloatArray] = field(default_factory=list)
     sigma: list[FloatArray] = field(default_factory=list)
+    relative: list[FloatArray] = field(default_factory=list)
+    sigma_relative: list[FloatArray] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
     info: list[Info] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
@@ -129,9 +146,14 @@ class _Trace:
         self.time.append(time)
         self.info.append(info)
         self.seconds.append(seconds)
+        found = nothing, nothing, nothing, nothing
         deviation = None if estimate is None else _deviation(estimate)
-        self.x.append(nothing if estimate is None or deviation is None else estimate.x)
-        self.sigma.append(nothing if deviation is None else deviation)
+        if estimate is not None and deviation is not None:
+            found = estimate.x, deviation, *states.relative(estimate)
+        for column, values in zip(
+            (self.x, self.sigma, self.relative, self.sigma_relative), found, strict=True
+        ):
+            column.append(values)
         self.nees.append(_nees(estimate, truth, states.folded))
 
 
@@ -319,7 +341,10 @@ def _tables(
             "detail": [i.detail for i in trace.info],
         }
     )
-    x, sigma = np.array(trace.x).reshape(count, n), np.array(trace.sigma).reshape(count, n)
+    value, sigma, relative, sigma_relative = (
+        (np.array(part).reshape(count, n) * states.factor).ravel()
+        for part in (trace.x, trace.sigma, trace.relative, trace.sigma_relative)
+    )
     estimated = pd.DataFrame(
         {
             "method": method,
@@ -327,8 +352,10 @@ def _tables(
             "time_utc": times.repeat(n),
             "element": np.tile(states.element, count),
             "quantity": np.tile(states.quantity, count),
-            "value": (x * states.factor).ravel(),
-            "sigma": (sigma * states.factor).ravel(),
+            "value": value,
+            "sigma": sigma,
+            "relative": relative,
+            "sigma_relative": sigma_relative,
         }
     )
     judged = np.array([i.judged for i in trace.info]).reshape(count, len(layout))
