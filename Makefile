@@ -55,6 +55,7 @@ endurance: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance kills --count $(or $(KILLS),1000)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance flips --count $(or $(FLIPS),10000)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance mutations --count $(or $(MUTATIONS),100000)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.endurance filters --count $(or $(STEPS),100000)
 
 clean:
 	rm -rf $(VENV) data/processed/*/ .pytest_cache .mypy_cache .ruff_cache

@@ -245,6 +245,23 @@ def test_linear_rows_have_the_slope_and_the_spread_of_the_measurement(lost: int 
     assert np.abs(correlation - np.eye(int(sound.sum()))).max() < 4.8 / np.sqrt(draws)
 
 
+def test_worthless_magnitude_makes_no_angle_exact() -> None:
+    """|V| reads 0.045 ± 6 p.u. beside an angle of 1e-3: that lies 1e-3 · 1 p.u. across, not 4.5e-5.
+
+    Nor does a magnitude below zero turn its angle by half a turn.
+    """
+    network = library.load("ieee14")
+    layout = SensorLayout.of(network, (VM, np.array([4]), BUS), (VA, np.array([4]), BUS))
+    layout = dataclasses.replace(layout, channel=("pmu:bus/5::vm_pu", "pmu:bus/5::va_degree"))
+    model, voltage = RectangularModel(network, layout), np.full(14, np.exp(0.3j))
+    on = np.ones(2, dtype=bool)
+    for size, sigma in ((0.045, 6.0), (-0.8, 6.0), (-0.1, 1e-3)):
+        _, _, spread = model.rows(np.array([size, 0.3]), np.array([sigma, 1e-3]), on, voltage)
+        np.testing.assert_allclose(spread, [sigma, 1e-3])
+    _, _, spread = model.rows(np.array([0.9, 0.3]), np.array([0.01, 1e-3]), on, voltage)
+    np.testing.assert_allclose(spread, [0.01, 0.9e-3])
+
+
 @pytest.mark.parametrize("grid", ["ieee14", "ieee33"])
 def test_linear_rows_have_the_whole_derivative(grid: str) -> None:
     """A row is a measured value over |V|, or an angle times |c|; Q lies along the conjugate."""

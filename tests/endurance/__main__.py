@@ -6,9 +6,9 @@ import argparse
 import sys
 import time
 
-from tests.endurance import flips, kills, mutations
+from tests.endurance import filters, flips, kills, mutations
 
-FORMS = {"kills": kills, "flips": flips, "mutations": mutations}
+FORMS = {"kills": kills, "flips": flips, "mutations": mutations, "filters": filters}
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from reference import channels_table
 from pse_analysis.errors import NotConverged, TableError
 from pse_analysis.estimation import Method, estimate
 from pse_analysis.estimation.core.interface import Estimator, Info, Snapshot, Voltages
-from pse_analysis.estimation.core.run import run
+from pse_analysis.estimation.core.run import ConsistencyParams, biased, run
 from pse_analysis.estimation.core.snapshots import Record, record
 from pse_analysis.estimation.filters.kalman import KalmanState, kalman_filter
 from pse_analysis.estimation.process import learn_from_history
@@ -266,6 +266,27 @@ def test_filter_that_is_far_too_sure_is_called_inconsistent() -> None:
     assert set(got.steps["status"].iloc[15:]) == {"inconsistent"}
     plain = run(filter_of(), iter(snapshots(30)), NETWORK, LAYOUT)
     assert set(plain.steps["status"]) == {"ok"}
+
+
+def test_meter_that_is_always_off_to_the_same_side_is_told() -> None:
+    """3 σ eight times in a row are 24/√8 = 8.5; the same to and fro are nothing, 40 σ once count 4.
+
+    A row that is not believed says nothing of the filter.
+    """
+    on, sigma = np.ones(2, dtype=bool), np.ones(2)
+
+    def told(off: list[float], phi: float = 0.0) -> list[int]:
+        info = [
+            Info(Status.OK, 1, 1.0, 1, on, np.array([0.1, one]), sigma, np.array([0.0, phi]))
+            for one in off
+        ]
+        return np.flatnonzero(biased(info, ConsistencyParams(), on)).tolist()
+
+    assert told([3.0] * 9) == [7, 8]
+    assert told([-3.0] * 9, phi=1.0) == []
+    assert told([3.0, -3.0] * 5) == []
+    assert told([40.0] + [0.0] * 20) == []
+    assert told([]) == []
 
 
 def test_nees_folds_angles_and_leaves_out_what_is_fixed() -> None:

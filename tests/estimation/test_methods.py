@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import sys
 import tomllib
@@ -79,6 +80,9 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "slot_s": (7200.0,),
     "bandwidth_s": (600.0,),
     "lowest": (0.9999,),
+    "doubt": (1.01, math.inf),
+    "lone": (1.5, math.inf),
+    "bias": (3.0, math.inf),
     "highest": (1.001,),
     "patience": (1, 9),
     "share": (0.9,),
@@ -230,9 +234,12 @@ def test_every_key_changes_the_estimate_or_is_refused(context: dict[str, Any]) -
     for place in [place for place in tried if place[0] == "consistency"]:
         # Whether a sum of NIS passes a bound is chance; see the test of the bounds below.
         tried[place] = True
+    judges = context.get("compose", {}).get("robustness", "none") != "none"
     if context.get("screening") == "innovation":
         # What the test refuses does not contradict the forecast any more, so none waits for that.
         tried["restart", "patience"] = True
+    if context.get("screening") == "innovation" or judges:
+        tried["restart", "doubt"] = tried["restart", "lone"] = True
     idle = [".".join(place) for place, moved in tried.items() if not moved]
     assert not idle
 

@@ -177,6 +177,36 @@ def test_nothing_is_carried_back_over_a_restart() -> None:
         np.testing.assert_array_equal(one.x, other.x)
 
 
+def test_what_later_instants_confirm_is_doubted_no_longer() -> None:
+    """A voltage moves by 0.1, 10 σ of its walk: the filter doubts it, its smoother does not.
+
+    What nobody confirms, one reading that is off by as much, is doubted by the smoother as well.
+    """
+    layout = phasors()
+    taken = walk(layout, 12, SEED, 0.0)
+    row, state = 0, N
+    assert layout.channel[row].startswith("vm")
+    estimator = made(layout, filter="ekf", variance=1e-4)
+    moved, spoilt = taken.z.copy(), taken.z.copy()
+    moved[6:, row] += 0.1
+    spoilt[6, row] += 0.1
+    found = {}
+    for name, z in (("plain", taken.z), ("moved", moved), ("spoilt", spoilt)):
+        record = replace(taken, z=z)
+        told = run(estimator, record.snapshots(), NETWORK, layout).steps["detail"][6]
+        assert ("doubtful" in told) is (name != "plain")
+        found[name] = smoothed(estimator, record)[6]
+    plain, after, wrong = found["plain"], found["moved"], found["spoilt"]
+    assert plain is not None
+    assert after is not None
+    assert wrong is not None
+    assert after.x[state] - plain.x[state] == pytest.approx(0.1, abs=0.012)
+    assert after.covariance[state, state] < 1.2 * plain.covariance[state, state]
+    assert wrong.covariance[state, state] > 1.2 * plain.covariance[state, state]
+    off = wrong.x[state] - plain.x[state]
+    assert abs(off) < 3.0 * np.sqrt(wrong.covariance[state, state])
+
+
 def test_an_instant_without_a_state_stays_without_one() -> None:
     layout = phasors()
     taken = walk(layout, 6, SEED, 0.0)

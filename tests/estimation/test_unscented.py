@@ -237,6 +237,27 @@ def test_sage_husa_is_its_recursion_and_falls_back_to_a_positive_form() -> None:
         sage_husa.sage_husa(sage_husa.constant(np.ones(3)), process, forgetting=1.0)
 
 
+def test_sage_husa_is_as_unsure_as_its_samples_are_few() -> None:
+    """Three states and one sample: Q is what was learnt and 3/4 of that size in the start's shape.
+
+    Beyond that, a drift that rests on few samples fades while nothing is measured.
+    """
+    made = sage_husa.sage_husa(
+        sage_husa.constant(np.array([1.0, 2.0, 3.0])), dynamics.random_walk(), forgetting=0.9
+    )
+    memory = made.begin(np.zeros(6), EPOCH)
+    step = Learnt(np.ones(3), np.array([3.0, 0.0, 0.0]), np.eye(3), np.eye(3))
+    learnt = made.learn(memory, step)
+    share = 0.1 / (1 - 0.9**2)
+    own = (1 - share) * np.diag([1.0, 2.0, 3.0]) + share * np.diag([9.0, 0.0, 0.0])
+    _, Q, _ = made.current(learnt, np.zeros(6), EPOCH)
+    size = np.trace(own) / 6.0
+    np.testing.assert_allclose(Q, own + 0.75 * size * np.diag([1.0, 2.0, 3.0]))
+    silent = made.wait(made.wait(learnt))
+    np.testing.assert_allclose(silent.mean, 0.81 * share)
+    np.testing.assert_array_equal(silent.covariance, learnt.covariance)
+
+
 def test_sage_husa_learns_the_noise_of_its_own_model() -> None:
     """The state walks with a tenth of the σ that the filter starts from."""
     b = still("ieee14")
@@ -249,6 +270,24 @@ def test_sage_husa_learns_the_noise_of_its_own_model() -> None:
         for learning in ("none", "sage_husa")
     )
     assert np.mean(learnt) < np.mean(known)
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_misfit_is_the_largest_residual_after_the_update(kind: str) -> None:
+    """R S⁻¹η, by the textbook's inverse, is nearly z - h(x̂); robust filters that name have none."""
+    b = still("ieee14")
+    z = b.exact[0] + b.layout.sigma * np.random.default_rng(SEED).standard_normal(len(b.layout))
+    z[7] += 5 * b.layout.sigma[7]
+    made = b.filter(kind, q=1e-8)
+    state, info = made.step(made.begin(b.truth[0], 1e-6 * b.start, EPOCH), b.snapshot(z))
+    residual = np.abs(z - made.model.h(state.x)) / b.layout.sigma
+    assert info.misfit == pytest.approx(residual.max(), rel=1e-3)
+    assert residual.argmax() == 7
+    z[7] = 1e3
+    robust = b.filter(kind, q=1e-8, robustness="per_channel")
+    _, info = robust.step(robust.begin(b.truth[0], 1e-6 * b.start, EPOCH), b.snapshot(z))
+    assert info.inflation[7] > 0
+    assert np.isnan(info.misfit)
 
 
 def test_any_combination_works() -> None:

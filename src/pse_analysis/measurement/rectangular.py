@@ -27,6 +27,8 @@ Linearisation = Literal["derivative", "transform"]
 """Whether a power's row follows the voltage at its meter, or takes it as predicted."""
 BENT = 10.0
 """How many times M σ_φ² the σ of a magnitude is at least where its phasor is taken for a whole."""
+SURE = 0.3
+"""Largest σ of a magnitude, as a share of it, whose phasor is taken for a whole."""
 Kept = TypeVar("Kept")
 
 
@@ -38,7 +40,8 @@ class RectangularModel:
     current: with the voltage |V|∠θ at the metered bus, e^{-jθ}c = (P - jQ)/|V|, whose covariance
     diag(σ_P², σ_Q²)/|V|² is diagonal too. A channel that lost its partner keeps its row: a
     magnitude alone is laid along the predicted angle, an angle alone is scaled by the predicted
-    magnitude. So are both where the magnitude is far more exact than its angle.
+    magnitude. So are both where the magnitude is far more exact than its angle, and where it is
+    hardly known: M σ_φ would be as wrong as M.
 
     The current conj(S/V) of a power moves with the voltage too, dI = conj(dS)/conj(V) -
     conj(S) conj(dV)/conj(V)². ``derivative`` has both terms in its rows, so that a power says
@@ -106,7 +109,7 @@ class RectangularModel:
         return Frame(pattern, unit, pattern.sign * value, spread)
 
     def _round(self, z: FloatArray, sigma: FloatArray) -> BoolArray:
-        """Rows whose phasor is nearly as uncertain along itself as across. (m,)
+        """Rows whose phasor is nearly as uncertain along itself as across, and surely one. (m,)
 
         A phasor is laid along its measured angle, which is wrong by σ_φ. Its magnitude then reads
         M σ_φ² too little, and a share σ_φ of what lies across.
@@ -114,7 +117,8 @@ class RectangularModel:
         size = np.where(self._angle, self.partner, np.arange(len(z)))
         angle = np.where(self._angle, np.arange(len(z)), self.partner)
         bent = np.abs(z[size]) * sigma[angle] ** 2
-        return np.asarray(~(self._angle | self._size) | (sigma[size] >= BENT * bent))
+        whole = (sigma[size] >= BENT * bent) & (sigma[size] <= SURE * z[size])
+        return np.asarray(~(self._angle | self._size) | whole)
 
     def pattern(self, rows: IntArray, paired: BoolArray) -> Pattern:
         """What is common to all frames of some rows, of which some have their partner."""

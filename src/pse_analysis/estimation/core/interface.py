@@ -89,6 +89,9 @@ class Info:
     tested : bool
         The status already says whether ``nis`` is as large as it should be, so that nobody tests it
         again.
+    misfit : float
+        Largest residual of a measurement that a filter has believed, R S⁻¹η, in units of its σ; NaN
+        where it named wrong ones, and where it was not asked.
 
     Rows with an innovation that were not used were refused.
     """
@@ -104,6 +107,7 @@ class Info:
     detail: str = ""
     reasons: npt.NDArray[np.int32] | None = None
     tested: bool = False
+    misfit: float = np.nan
 
     @property
     def judged(self) -> BoolArray:
@@ -169,12 +173,15 @@ class Dynamics(NamedTuple):
         Estimate of a mean and covariance that stand in the place of the state's own.
     difference : (s, s) -> (N,) ndarray
         s₁ - s₂, angles taken by their shorter way.
+    undoubted : state -> state
+        The state before a doubtful snapshot was held against it; None where none was.
     """
 
     belief: Callable[[Any], tuple[FloatArray, FloatArray]]
     predict: Callable[[Any, Snapshot], Transition]
     read: Callable[[Any, FloatArray, FloatArray], Estimate]
     difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract
+    undoubted: Callable[[Any], Any] = lambda _state: None
 
     def inside(self, unwrap: Callable[[Any], Any]) -> Dynamics:
         """The same for a state that holds the filter's own among other things."""
@@ -189,14 +196,15 @@ class Dynamics(NamedTuple):
 class Estimator(NamedTuple):
     """A method: three functions over an opaque state.
 
-    Where they are given, ``widened`` makes a state far more uncertain, ``dynamics`` lets a smoother
-    look back from later instants, and ``again`` starts from a snapshot and nothing else.
+    Where they are given, ``with_covariance`` is a state with another covariance, ``dynamics`` knows
+    mean and covariance of a state and lets a smoother look back from later instants, and ``again``
+    starts from a snapshot and nothing else.
     """
 
     name: str
     init: Callable[[Snapshot], tuple[Any, Info]]
     step: Callable[[Any, Snapshot], tuple[Any, Info]]
     read: Callable[[Any], Estimate | None]
-    widened: Callable[[Any], Any] | None = None
+    with_covariance: Callable[[Any, FloatArray], Any] | None = None
     dynamics: Dynamics | None = None
     again: Callable[[Snapshot], tuple[Any, Info]] | None = None

@@ -17,8 +17,11 @@ from pse_analysis.errors import NotConverged, ParameterError, Unobservable
 from pse_analysis.estimation.core.interface import FAILURES, Estimate, Estimator, Info, Snapshot
 from pse_analysis.machine import STATES, Machine
 from pse_analysis.measurement import Model, SensorLayout, wrap
+from pse_analysis.parameters import Unbounded
 from pse_analysis.vocabulary import Status
 
+LARGEST = 4.0
+"""Most that a single normalised innovation counts for where many are added up."""
 JITTER = 1e-10
 """Share of the largest variance that rounding may take from one that is zero."""
 
@@ -40,11 +43,17 @@ class ConsistencyParams:
         filter's own model, would condemn every filter.
     confidence : float
         Share of good filters between the χ² bounds.
+    bias : float
+        Sum of the normalised innovations of one channel over the last steps, over the root of their
+        number, beyond which it is as well. Innovations of a good filter are independent from step
+        to step; a meter that is wrong all the time, and a filter that is lost, show by their sign.
+        Angles are left out, because what they count from may turn.
     """
 
     steps: int = 12
     ratio: tuple[float, float] = (0.5, 2.0)
     confidence: float = 0.999
+    bias: Unbounded = 8.0
 
     def __post_init__(self) -> None:
         low, high = self.ratio
@@ -53,6 +62,8 @@ class ConsistencyParams:
                 "consistency: expected steps ≥ 1, ratio = [below 1, above 1] and 0 < confidence < "
                 f"1, received {self.steps}, {list(self.ratio)} and {self.confidence}"
             )
+        if not self.bias >= 3.0:
+            raise ParameterError(f"consistency: expected bias ≥ 3, received {self.bias}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,10 +303,9 @@ def consistent(nis: FloatArray, dof: npt.NDArray[np.int64], params: ConsistencyP
     At the start there are fewer; the first alone is as much as a single snapshot has to show.
     """
     known = np.isfinite(nis) & (dof > 0)
-    total, freedom = (
-        pd.Series(np.where(known, part, 0.0)).rolling(params.steps, min_periods=1).sum().to_numpy()
-        for part in (nis, dof)
-    )
+    total, freedom = _windowed(
+        np.stack([np.where(known, part, 0.0) for part in (nis, dof)], axis=1), params.steps
+    ).T
     with np.errstate(invalid="ignore", divide="ignore"):
         tail = 0.5 * (1.0 - params.confidence)
         low, high = stats.chi2.ppf([[tail], [1.0 - tail]], freedom)
@@ -303,6 +313,31 @@ def consistent(nis: FloatArray, dof: npt.NDArray[np.int64], params: ConsistencyP
         wide = (ratio >= params.ratio[0]) & (ratio <= params.ratio[1])
     judged = np.isfinite(total) & (freedom > 0)
     return np.asarray(~judged | wide | ((total >= low) & (total <= high)))
+
+
+def biased(info: Sequence[Info], params: ConsistencyParams, judged: BoolArray) -> BoolArray:
+    """Whether a channel was off its forecast to the same side for the last steps, at every step.
+
+    Of the channels (m,), those that are to be ``judged`` count.
+    """
+    m = len(judged)
+    off = np.array([i.innovation for i in info]).reshape(len(info), m)
+    sigma = np.array([i.sigma_innovation for i in info]).reshape(len(info), m)
+    # What was not believed says nothing about the filter.
+    believed = np.array([i.used & (i.inflation == 0) & judged for i in info]).reshape(len(info), m)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.clip(np.where(believed, off / sigma, np.nan), -LARGEST, LARGEST)
+    known = np.isfinite(off)
+    total, count = (
+        _windowed(part, params.steps) for part in (np.where(known, off, 0.0), known.astype(float))
+    )
+    size = np.abs(total) / np.sqrt(np.maximum(count, 1.0))
+    return np.asarray((size > params.bias).any(axis=1))
+
+
+def _windowed(values: FloatArray, steps: int) -> FloatArray:
+    """Sums over the last steps, of which there are fewer at the start."""
+    return np.asarray(pd.DataFrame(values).rolling(steps, min_periods=1).sum())
 
 
 def _tables(
@@ -317,7 +352,8 @@ def _tables(
     count, n = len(times), len(states)
     nis = np.array([i.nis for i in trace.info])
     dof = np.array([i.dof for i in trace.info], dtype=np.int64)
-    good = consistent(nis, dof, consistency or ConsistencyParams())
+    params = consistency or ConsistencyParams()
+    good = consistent(nis, dof, params) & ~biased(trace.info, params, ~layout.angular)
     status = [
         Status.INCONSISTENT if i.status is Status.OK and not (fits or i.tested) else i.status
         for i, fits in zip(trace.info, good, strict=True)

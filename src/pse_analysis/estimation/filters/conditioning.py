@@ -295,7 +295,7 @@ class Solved:
 
     def correction(self) -> FloatArray:
         """K η = C S⁻¹ η, without X. (N,)"""
-        return np.asarray(self._cross @ blas.dtrsv(self.chol_S, self.white, lower=1, trans=1))
+        return np.asarray(self._cross @ weighted(self.chol_S, self.white))
 
     def reduced(self, P: FloatArray, relaxed: FloatArray | None = None) -> FloatArray:
         """P - X Xᵀ + Z Zᵀ with Z = X Y of `_relaxation`. (N, N)"""
@@ -305,6 +305,22 @@ class Solved:
             lost = blas.dgemm(1.0, self.X, relaxed)
             left += lost @ lost.T
         return np.asarray(left)
+
+
+def weighted(chol_S: FloatArray, white: FloatArray) -> FloatArray:
+    """S⁻¹ η from S = L Lᵀ and L⁻¹ η. (m,)"""
+    return np.asarray(blas.dtrsv(chol_S, white, lower=1, trans=1))
+
+
+def misfit(chol_S: FloatArray, white: FloatArray, sigma: FloatArray) -> float:
+    """Largest residual of measurements that are all believed, in units of its σ.
+
+    Notes
+    -----
+    z - h(x̂) = η - H K η = R S⁻¹η. Unlike an innovation it shows a wrong measurement where the
+    forecast knows less than the others.
+    """
+    return float(np.abs(sigma * weighted(chol_S, white)).max(initial=0.0))
 
 
 def _relaxation(V: FloatArray, added: FloatArray) -> FloatArray:

@@ -28,8 +28,8 @@ from pse_analysis.estimation.core.interface import (
 )
 from pse_analysis.estimation.filters.angle_reference import AngleReference, Frame, absolute
 from pse_analysis.estimation.filters.augmented_state import AugmentedState, Belief
-from pse_analysis.estimation.filters.conditioning import Prior, Solved
-from pse_analysis.estimation.filters.restart import WIDER, gross_errors
+from pse_analysis.estimation.filters.conditioning import Prior, Solved, misfit
+from pse_analysis.estimation.filters.restart import gross_errors
 from pse_analysis.estimation.filters.row_moments import Expansion, Interval, Reader, RowMoments
 from pse_analysis.estimation.process import covariance_matching, dynamics
 from pse_analysis.estimation.process.covariance_matching import CovarianceMatching, Matched
@@ -207,6 +207,7 @@ class KalmanFilter:
             told[1],
             np.zeros(m),
             reasons=_refusals(refused),
+            misfit=misfit(solved.chol_S, solved.white, found.linear.spread),
         )
 
     def _moved(self, belief: Belief, state: KalmanState, snapshot: Snapshot) -> _Moved:
@@ -374,8 +375,8 @@ def kalman_filter(
     def read(state: KalmanState) -> Voltages:
         return made.estimate(state, state.x, state.P)
 
-    def widened(state: KalmanState) -> KalmanState:
-        return replace(state, P=WIDER**2 * state.P)
+    def with_covariance(state: KalmanState, P: FloatArray) -> KalmanState:
+        return replace(state, P=P)
 
     moves = Dynamics(lambda state: (state.x, state.P), made.predict, made.estimate)
     return Estimator(
@@ -383,7 +384,7 @@ def kalman_filter(
         lambda snapshot: begun(start.first(snapshot), snapshot.time),
         made.step,
         read,
-        widened,
+        with_covariance,
         moves,
         lambda snapshot: begun(start.alone(snapshot), snapshot.time),
     )

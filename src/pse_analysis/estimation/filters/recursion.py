@@ -25,7 +25,7 @@ from pse_analysis.estimation.core.interface import (
 from pse_analysis.estimation.filters.angle_reference import AngleReference, Frame, absolute
 from pse_analysis.estimation.filters.conditioning import Prior
 from pse_analysis.estimation.filters.protection import Recovery
-from pse_analysis.estimation.filters.restart import ABSURD, WIDER
+from pse_analysis.estimation.filters.restart import ABSURD
 from pse_analysis.estimation.filters.square_root import carried
 from pse_analysis.estimation.filters.update import Observation, Update, update
 from pse_analysis.estimation.process.dynamics import Process
@@ -168,7 +168,13 @@ class GaussianFilter:
         used = snapshot.available & snapshot.fresh
         if not used.any():
             ahead = replace(
-                state, s=prior.s, P=prior.P, x=prior.x, process=moved.process, chol_P=prior.carried
+                state,
+                s=prior.s,
+                P=prior.P,
+                x=prior.x,
+                process=moved.process,
+                noise=self.noise.wait(moved.noise),
+                chol_P=prior.carried,
             )
             ahead = replace(ahead, frame=moved.frame)
             return ahead, Info.nothing(m, Status.PREDICTED)
@@ -351,9 +357,8 @@ def estimator(name: str, made: GaussianFilter, start: Start) -> Estimator:
     def read(state: GaussianState) -> Voltages:
         return made.estimate(state, state.s, state.P)
 
-    def widened(state: GaussianState) -> GaussianState:
-        root = None if state.chol_P is None else WIDER * state.chol_P
-        return replace(state, P=WIDER**2 * state.P, chol_P=root)
+    def with_covariance(state: GaussianState, P: FloatArray) -> GaussianState:
+        return replace(state, P=P, chol_P=None)
 
     dynamics = Dynamics(
         lambda state: (state.s, state.P), made.predict, made.estimate, made.difference
@@ -363,7 +368,7 @@ def estimator(name: str, made: GaussianFilter, start: Start) -> Estimator:
         lambda snapshot: begun(start.first(snapshot), snapshot.time),
         made.step,
         read,
-        widened,
+        with_covariance,
         dynamics,
         lambda snapshot: begun(start.alone(snapshot), snapshot.time),
     )

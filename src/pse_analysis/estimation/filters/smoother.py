@@ -28,6 +28,8 @@ from pse_analysis.estimation.core.interface import (
 )
 from pse_analysis.vocabulary import Status
 
+AGREE = 4.0
+"""σ by which later instants may differ from a forecast and still confirm what it came from."""
 WIDENED = 1.0 + 1e-6
 """σ² after an instant over that before it from which a filter has been made less certain."""
 
@@ -118,6 +120,7 @@ class Trail:
     def _narrowed(self, k: int, state: Any) -> bool:
         """Whether a state is no less certain than what was expected of it before the instant."""
         dynamics = _dynamics(self.estimator)
+        state = dynamics.undoubted(state) or state
         try:
             ahead = dynamics.predict(self._before, self.snapshots[k]).covariance
         except FAILURES:
@@ -141,25 +144,42 @@ class Trail:
         return states
 
     def smoothed(self) -> list[Estimate | None]:
-        """Estimate of every instant given all of them; None where the filter has none."""
+        """Estimate of every instant given all of them; None where the filter has none.
+
+        A snapshot that the filter doubted (`pse_analysis.estimation.filters.restart`) is believed
+        if the later ones confirm it; if not, nothing is known of what came before it.
+        """
         dynamics = _dynamics(self.estimator)
         out: list[Estimate | None] = [None] * len(self._follows)
         later: Smoothed | None = None
+        doubted = False
         last = len(self._follows) - 1
         for first in sorted(self._kept, reverse=True):
             for k, state in reversed(list(enumerate(self._segment(first, last), first))):
                 if state is None:
                     later = None
                     continue
-                belief = dynamics.belief(state)
-                alone = Smoothed(*belief)
-                if later is None or not self._follows[k + 1]:
-                    later = alone
-                else:
-                    later = self._looked_back(k, state, later, alone)
+                known = None if later is None or doubted or not self._follows[k + 1] else later
+                before = dynamics.undoubted(state)
+                doubted = before is not None and not self._confirmed(k, before, known)
+                state = state if before is None or doubted else before
+                alone = Smoothed(*dynamics.belief(state))
+                later = alone if known is None else self._looked_back(k, state, known, alone)
                 out[k] = dynamics.read(state, later.s, later.P)
             last = first - 1
         return out
+
+    def _confirmed(self, k: int, state: Any, later: Smoothed | None) -> bool:
+        """Whether the later instants lead to about what a state makes one expect."""
+        if later is None:
+            return False
+        dynamics = _dynamics(self.estimator)
+        try:
+            ahead = dynamics.predict(state, self.snapshots[k + 1])
+        except FAILURES:
+            return False
+        off = dynamics.difference(later.s, ahead.mean)
+        return bool((off**2 <= AGREE**2 * np.diagonal(ahead.covariance)).all())
 
     def _looked_back(self, k: int, state: Any, later: Smoothed, alone: Smoothed) -> Smoothed:
         """A state given the later ones; by itself where their numbers do not allow more."""

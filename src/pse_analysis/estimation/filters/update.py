@@ -13,7 +13,7 @@ from pse_analysis.arrays import FloatArray, IntArray
 from pse_analysis.estimation.bad_data.identification import Deletion, of_snapshot
 from pse_analysis.estimation.bad_data.robust import FORGETTING, GrossErrorTest, InnovationStats
 from pse_analysis.estimation.core.interface import Info, Snapshot
-from pse_analysis.estimation.filters.conditioning import Posterior, Predicted, Prior
+from pse_analysis.estimation.filters.conditioning import Posterior, Predicted, Prior, misfit
 from pse_analysis.estimation.filters.restart import ABSURD, gross_errors
 from pse_analysis.measurement import MeasurementModel, wrap
 from pse_analysis.vocabulary import Status
@@ -60,6 +60,8 @@ class UpdateReport(NamedTuple):
         Its degrees of freedom.
     innovation, variance, inflation : (r,) ndarray
         Of the rows that report.
+    misfit : float
+        As in `Info`.
     """
 
     iterations: int
@@ -68,6 +70,7 @@ class UpdateReport(NamedTuple):
     innovation: FloatArray
     variance: FloatArray
     inflation: FloatArray
+    misfit: float = np.nan
 
     def info(self, status: Status, snapshot: Snapshot, rows: IntArray, detail: str) -> Info:
         """The same for all rows of the layout."""
@@ -86,6 +89,7 @@ class UpdateReport(NamedTuple):
             deviation,
             inflation,
             detail,
+            misfit=self.misfit,
         )
 
 
@@ -101,6 +105,8 @@ class Update(NamedTuple):
         Memory of the observation.
     iterations : int
     converged : bool
+    misfit : float
+        As in `Info`.
     """
 
     found: Posterior
@@ -108,13 +114,20 @@ class Update(NamedTuple):
     alpha: float
     iterations: int
     converged: bool
+    misfit: float
 
     @property
     def report(self) -> UpdateReport:
         """The report of the update."""
         found, dof = self.found, len(self.innovation)
         return UpdateReport(
-            self.iterations, found.nis, dof, self.innovation, found.variance, found.inflation
+            self.iterations,
+            found.nis,
+            dof,
+            self.innovation,
+            found.variance,
+            found.inflation,
+            self.misfit,
         )
 
 
@@ -157,7 +170,7 @@ def update(
     angular = model.angular[rows]
     at = prior.s
     converged = observation.passes == 1
-    verdict = partial(_inflation, judge, absurd, partial(of_snapshot, model, prior.x, rows))
+    verdict = _Verdict(judge, absurd, partial(of_snapshot, model, prior.x, rows))
     for passes in range(1, observation.passes + 1):  # noqa: B007 (reported below)
         predicted = observation.predict(prior, snapshot, rows, alpha, at)
         eta = snapshot.z[rows] - predicted.mean
@@ -172,17 +185,41 @@ def update(
         left = observation.remainder(prior, rows, last, at, snapshot.sigma[rows])
         if left.any():
             found = predicted.condition(prior, eta, R + left**2, verdict)
-    return Update(found, eta, alpha, passes, converged)
+    return Update(found, eta, alpha, passes, converged, verdict.misfit)
 
 
-def _inflation(
-    judge: GrossErrorTest,
-    absurd: float,
-    alone: Callable[..., Deletion],
-    found: InnovationStats,
-) -> FloatArray:
-    """A judgement that may ask the snapshot alone, of what is not wrong beyond any doubt."""
-    gross = gross_errors(found.innovation, found.variance, found.nis, absurd)
-    if gross.any():
-        return np.where(gross, FORGETTING * found.innovation**2 / found.noise, 0.0)
-    return judge(replace(found, alone=partial(alone, found.innovation, found.noise)))
+class _Verdict:
+    """A judgement that may ask the snapshot alone, of what is not wrong beyond any doubt.
+
+    Parameters
+    ----------
+    judge : GrossErrorTest
+    absurd : float
+    alone : (innovation, noise, rows) -> Deletion
+
+    Attributes
+    ----------
+    misfit : float
+        Of the last judgement; NaN where it named any measurement.
+    """
+
+    def __init__(
+        self, judge: GrossErrorTest, absurd: float, alone: Callable[..., Deletion]
+    ) -> None:
+        self._judge, self._absurd, self._alone = judge, absurd, alone
+        self.misfit = np.nan
+
+    def __call__(self, found: InnovationStats) -> FloatArray:
+        """Inflation φ of the noise. (r,)"""
+        phi = self._inflation(found)
+        self.misfit = np.nan
+        if not phi.any():
+            self.misfit = misfit(found.root.chol, found.white, np.sqrt(found.noise))
+        return phi
+
+    def _inflation(self, found: InnovationStats) -> FloatArray:
+        gross = gross_errors(found.innovation, found.variance, found.nis, self._absurd)
+        if gross.any():
+            return np.where(gross, FORGETTING * found.innovation**2 / found.noise, 0.0)
+        alone = partial(self._alone, found.innovation, found.noise)
+        return self._judge(replace(found, alone=alone))

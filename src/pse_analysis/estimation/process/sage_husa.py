@@ -53,12 +53,15 @@ class Noise(NamedTuple):
     learn : (memory, Learnt) -> memory
     voltages : VoltageNoise
         What it starts from.
+    wait : memory -> memory
+        At an instant at which nothing was measured.
     """
 
     begin: Callable[[FloatArray, np.datetime64], Any]
     current: Callable[[Any, FloatArray, np.datetime64], tuple[FloatArray, FloatArray, Any]]
     learn: Callable[[Any, Learnt], Any]
     voltages: VoltageNoise
+    wait: Callable[[Any], Any] = lambda memory: memory
 
 
 def constant(covariance: FloatArray) -> VoltageNoise:
@@ -159,9 +162,13 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
     The mean of so few steps is never zero, and a filter that follows it drifts. It is therefore
     shrunk as James and Stein shrink a mean, q (1 - Σw² E|x̂ - F x̂₋₁ - g|²/|q|²)₊.
 
-    Fading memory holds (1+b)/(1-b) steps, few more than a grid has voltages, and the covariance of
-    so few samples is far too small in some directions. What the filter uses is therefore drawn
-    towards the shape of the start, by the share n/(n + steps in memory) and at the size learnt.
+    Fading memory holds (1+b)/(1-b) = ν steps, few more than a grid has voltages, n, and the
+    covariance of so few samples is far too small in some directions. What the filter uses is
+    therefore drawn towards the shape of the start, by the share n/(n + ν) and at the size learnt,
+    and what is left of the samples is as much larger as n of them make a forecast, (n + ν)/ν.
+
+    q is as uncertain as a mean of so few samples, which P does not know. What it moves while
+    nothing is measured would be wrong by as much as all noise of that time, so it fades by b.
     """
     if not 0.0 < forgetting < 1.0:
         raise ParameterError(f"sage_husa: expected 0 < forgetting < 1, received {forgetting}")
@@ -178,8 +185,7 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
             return memory.drift, memory.covariance, memory
         share = n / (n + min(memory.steps, (1.0 + forgetting) / (1.0 - forgetting)))
         scale = float(np.trace(memory.covariance)) / size
-        drawn = (1.0 - share) * memory.covariance + (share * scale) * memory.start
-        return memory.drift, drawn, memory
+        return memory.drift, memory.covariance + (share * scale) * memory.start, memory
 
     def learn(memory: _Moments, step: Learnt) -> _Moments:
         count = memory.steps + 1
@@ -193,7 +199,10 @@ def sage_husa(voltages: VoltageNoise, process: Process, forgetting: float = 0.97
         covariance = unbiased if _positive(unbiased) else safe
         return _Moments(mean, covariance, memory.start, count, square, weights)
 
-    return Noise(begin, current, learn, voltages)
+    def wait(memory: _Moments) -> _Moments:
+        return memory._replace(mean=forgetting * memory.mean)
+
+    return Noise(begin, current, learn, voltages, wait)
 
 
 def _positive(matrix: FloatArray) -> bool:
