@@ -111,7 +111,7 @@ class States:
         )
 
     def relative(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-        """Angles less that of the reference of their island, and σ of it; NaN elsewhere. (n,)"""
+        """Returns angles less that of their island's reference, and σ; NaN elsewhere. (n,)"""
         value, sigma = np.full((2, len(self)), np.nan)
         angle = np.flatnonzero(self.reference >= 0)
         at, P = self.reference[angle], estimate.covariance

@@ -30,7 +30,7 @@ NEAR = 4.0
 
 
 class CommonAngle(NamedTuple):
-    """By how much most angles are turned alike.
+    """Holds the angle by which most phasors are turned alike.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ def common_angle(deviation: FloatArray, sigma: FloatArray) -> CommonAngle:
 
 
 class Frame(NamedTuple):
-    """The angle that a filter's own angles count from.
+    """Holds the angle that a filter's own angles count from.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Frame(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """A reference at the next instant.
+    """Says where the reference stands at the next instant, and how surely.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class AngleReference:
         self._matching = CovarianceMatching(lambda _voltage: (), np.array([variance]))
 
     def begin(self, *, measured: bool = True) -> Frame:
-        """A frame that angles are measured in, or may be any if none was measured."""
+        """Returns the first frame: that of the phasors, or any if no angle was measured."""
         doubt = 0.0 if measured else ANY_RAD**2
         return Frame(0.0, np.zeros(len(self._angular)), self._matching.begin(), doubt=doubt)
 
@@ -207,7 +207,7 @@ class AngleReference:
 
 
 def absolute(x: FloatArray, covariance: FloatArray, frame: Frame | None) -> Estimate:
-    """Estimate whose angles count as measured ones do, from what a filter knows in its frame.
+    """Returns an estimate whose angles count as measured ones do.
 
     Parameters
     ----------

@@ -40,11 +40,11 @@ class Start:
         self._wls = WeightedLeastSquares(network, layout)
 
     def alone(self, snapshot: Snapshot) -> tuple[WlsSolution | None, Info]:
-        """The estimate of a snapshot, or None and why there is none; see `begin`."""
+        """Starts from a snapshot alone; None, and why, where it has no estimate (see `begin`)."""
         return begin(self._wls, snapshot)
 
     def first(self, snapshot: Snapshot) -> tuple[WlsSolution | None, Info]:
-        """The same, with the prior where the snapshot leaves states open or nearly so."""
+        """Starts from a snapshot, and from the prior where that leaves states nearly open."""
         found, info = self.alone(snapshot)
         if self._beside is None or not snapshot.available.any():
             return found, info

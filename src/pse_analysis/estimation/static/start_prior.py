@@ -36,7 +36,7 @@ DAY_S = 86400.0
 
 
 class StartPrior(NamedTuple):
-    """Usual values as measurements.
+    """Holds usual injections and held voltages as if they were measured.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class StartPrior(NamedTuple):
     together: float
 
     def beside(self, layout: SensorLayout, snapshot: Snapshot) -> tuple[FloatArray, FloatArray]:
-        """Usual values and their σ at the hour that the meters of a snapshot tell.
+        """Returns usual values and their σ, scaled by what the metered loads of a snapshot show.
 
         Loads rise and fall together. Those that are metered tell by how much, and the others are
         taken to do the same; what is left of the doubt is common to them.
